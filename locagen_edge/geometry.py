@@ -1,0 +1,108 @@
+"""The array: positions, pairs, delays, and the angles between.
+
+Axes are MAVLink's FRD: x forward, y right, z down, metres. Azimuth is atan2(y, x), so 0 is ahead and
+positive is clockwise seen from above; elevation is positive up. `u` is the unit vector from the array to
+the source; pair (i, j), i < j, has the delay t_j - t_i = (p_i - p_j) . u / c: positive when j hears later.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from locagen_edge.types import F64
+
+KELVIN = 273.15
+
+
+def speed_of_sound(temperature_c: float) -> float:
+    """Speed of sound in dry air, m/s: 331.3 sqrt(1 + T / 273.15).
+
+    Kinsler, Frey, Coppens & Sanders, *Fundamentals of Acoustics*, 4th ed., section 5.6. Humidity adds at
+    most 0.4 % at 20 degrees Celsius, left out: it costs less than a hundredth of a degree of bearing.
+    """
+    return 331.3 * math.sqrt(1.0 + temperature_c / KELVIN)
+
+
+def direction(azimuth_rad: float, elevation_rad: float = 0.0) -> F64:
+    """Unit vector (3,) in FRD from the array to a source at these angles."""
+    horizontal = math.cos(elevation_rad)
+    return np.array(
+        [
+            horizontal * math.cos(azimuth_rad),
+            horizontal * math.sin(azimuth_rad),
+            -math.sin(elevation_rad),
+        ]
+    )
+
+
+def angles(u: F64) -> tuple[float, float]:
+    """Azimuth and elevation in radians of a vector (3,) in FRD, of any length above zero."""
+    return math.atan2(u[1], u[0]), math.atan2(-u[2], math.hypot(u[0], u[1]))
+
+
+def wrap(angle_rad: float) -> float:
+    """The same angle within -pi (included) to pi (left out)."""
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def compass_deg(angle_rad: float) -> float:
+    """Degrees [0, 360) for people."""
+    return math.degrees(angle_rad) % 360.0 % 360.0  # twice: -1e-17 % 360 is 360.0
+
+
+@dataclass(frozen=True, eq=False)
+class MicArray:
+    """Microphone positions and what follows from them alone."""
+
+    positions_m: F64
+    """(mics, 3) FRD"""
+
+    @property
+    def mics(self) -> int:
+        return len(self.positions_m)
+
+    @cached_property
+    def pairs(self) -> tuple[tuple[int, int], ...]:
+        """(0, 1), (0, 2), ... (1, 2), ...: the order of every (pairs, ...) array, in C too."""
+        return tuple((i, j) for i in range(self.mics) for j in range(i + 1, self.mics))
+
+    @cached_property
+    def baselines_m(self) -> F64:
+        """(pairs, 3): p_i - p_j, so that a delay is baseline . u / c."""
+        return np.array([self.positions_m[i] - self.positions_m[j] for i, j in self.pairs])
+
+    @cached_property
+    def spacing_m(self) -> F64:
+        """(pairs,): distance between the two microphones."""
+        distance: F64 = np.linalg.norm(self.baselines_m, axis=1)
+        return distance
+
+    @cached_property
+    def dimensions(self) -> int:
+        """1: all on a line, 2: in a plane, 3: in space (1 mm is the tolerance)."""
+        return int(np.linalg.matrix_rank(self.baselines_m, tol=1e-3))
+
+    def longest_delay_s(self, speed_m_s: float) -> float:
+        """The longest delay that any pair can see, seconds."""
+        return float(self.spacing_m.max()) / speed_m_s
+
+    def delays_s(self, u: F64, speed_m_s: float) -> F64:
+        """Delays (pairs,) of a plane wave from direction u (3,)."""
+        delays: F64 = self.baselines_m @ u / speed_m_s
+        return delays
+
+    def arrivals_s(self, source_m: F64, speed_m_s: float) -> F64:
+        """Travel times (mics,) from a point source at (3,) metres."""
+        times: F64 = np.linalg.norm(self.positions_m - source_m, axis=1) / speed_m_s
+        return times
+
+
+def equilateral(side_m: float = 0.10) -> MicArray:
+    """Three microphones around the origin: the first ahead, the others behind right and behind left."""
+    radius = side_m / math.sqrt(3.0)
+    azimuths = np.radians([0.0, 120.0, 240.0])
+    return MicArray(np.stack([radius * np.cos(azimuths), radius * np.sin(azimuths), np.zeros(3)], axis=1))

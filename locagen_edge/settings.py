@@ -1,0 +1,537 @@
+"""Settings: nested frozen dataclasses, filled from TOML, refused with every fault at once.
+
+Each field states its own sentence, unit, range or choices beside its default. The reader, the checks and
+the sample file (`python -m locagen_edge.settings`, which is systemd/locagen-edge.toml) all come from
+that one place, so they cannot disagree.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import textwrap
+import tomllib
+import types
+import typing
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from locagen_edge.errors import SettingsError
+from locagen_edge.geometry import KELVIN, MicArray, equilateral, speed_of_sound
+
+DEFAULT_PATH = Path("/etc/locagen-edge/locagen-edge.toml")
+
+NAME = r"[a-z0-9][a-z0-9_.-]*"
+
+
+def setting(
+    default: Any,
+    text: str,
+    *,
+    unit: str = "",
+    least: float = -math.inf,
+    most: float = math.inf,
+    choices: tuple[str, ...] = (),
+    pattern: str = "",
+) -> Any:
+    """A dataclass field that carries its own manual entry and limits (both ends allowed)."""
+    meta = {
+        "text": text,
+        "unit": unit,
+        "least": least,
+        "most": most,
+        "choices": choices,
+        "pattern": pattern,
+    }
+    return field(default=default, metadata=meta)
+
+
+def _triangle() -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(round(float(x), 6) + 0.0 for x in row) for row in equilateral().positions_m)
+
+
+@dataclass(frozen=True)
+class ArraySettings:
+    """The microphones, as they sit on the frame."""
+
+    positions_m: tuple[tuple[float, ...], ...] = setting(
+        _triangle(),
+        "One row per microphone, in the order of audio.channel_map: x forward, y right, z down, from any "
+        "common origin. The default is an equilateral triangle of 10 cm.",
+        unit="m",
+        least=-10,
+        most=10,
+    )
+    tolerance_m: float = setting(
+        0.0005,
+        "How well those positions are known (1-sigma). It goes into every sigma: 1 mm costs about half a "
+        "degree on a 10 cm array.",
+        unit="m",
+        least=0,
+        most=0.1,
+    )
+
+
+@dataclass(frozen=True)
+class EnvironmentSettings:
+    """The air between caller and microphones."""
+
+    temperature_c: float = setting(
+        20.0,
+        "Air temperature; the speed of sound follows from it.",
+        unit="degrees Celsius",
+        least=-60,
+        most=60,
+    )
+
+
+@dataclass(frozen=True)
+class AudioSettings:
+    """Where sound comes from, and how it is cut into frames."""
+
+    source: str = setting(
+        "sim",
+        "`alsa` for microphones, `wav` for a recording, `sim` for a synthetic drone scene.",
+        choices=("alsa", "wav", "sim"),
+    )
+    device: str = setting(
+        "", "ALSA: part of the device's name as `locagen-edge devices` prints it; empty: the default."
+    )
+    device_rate_hz: int = setting(
+        48000, "ALSA: the rate asked of the device.", unit="Hz", least=8000, most=192000
+    )
+    device_channels: int = setting(
+        3, "ALSA: how many channels the device is opened with.", unit="channels", least=1, most=64
+    )
+    sample_format: str = setting(
+        "int16", "ALSA: how the device delivers samples.", choices=("int16", "float32")
+    )
+    channel_map: tuple[int, ...] = setting(
+        (0, 1, 2),
+        "Which channel of the device or file is which row of array.positions_m, counted from 0.",
+        least=0,
+        most=63,
+    )
+    file: str = setting("", "WAV: the recording (WAV, FLAC, any rate; channels by channel_map).")
+    loop: bool = setting(False, "WAV: begin again at the end instead of stopping.")
+    rate_hz: int = setting(
+        10000, "The processing rate; every source is resampled to it.", unit="Hz", least=4000, most=96000
+    )
+    frame: int = setting(1024, "Samples in a frame: a power of two.", unit="samples", least=256, most=4096)
+    hop: int = setting(
+        512, "Samples from one frame to the next; at most a frame.", unit="samples", least=32, most=4096
+    )
+
+
+@dataclass(frozen=True)
+class SimSettings:
+    """The synthetic scene: a caller that circles a hovering drone, heard under four rotors."""
+
+    call: str = setting("scream", "What calls.", choices=("white", "speech", "scream", "whistle", "tone"))
+    azimuth_deg: float = setting(
+        40.0, "Where the caller starts, clockwise from ahead.", unit="degrees", least=-360, most=360
+    )
+    turn_deg_s: float = setting(
+        6.0, "How fast the caller goes round, clockwise.", unit="degrees/s", least=-180, most=180
+    )
+    distance_m: float = setting(30.0, "Horizontal distance of the caller.", unit="m", least=0.5, most=1000)
+    height_m: float = setting(15.0, "Height of the array above the caller.", unit="m", least=0, most=1000)
+    call_s: float = setting(1.5, "Length of one call.", unit="s", least=0.05, most=3600)
+    pause_s: float = setting(
+        0.7, "Silence between two calls; 0: it never stops.", unit="s", least=0, most=3600
+    )
+    snr_db: float = setting(
+        5.0, "In-band level of the call over rotors and sensor noise together.", unit="dB", least=-60, most=80
+    )
+    rotors: int = setting(4, "Number of rotors; 0: sensor noise alone.", unit="rotors", least=0, most=8)
+    rotor_arm_m: float = setting(
+        0.30, "Distance of each rotor's hub from the origin.", unit="m", least=0.05, most=5
+    )
+    throttle: float = setting(0.5, "Mean throttle; the blade rate follows it.", least=0, most=1)
+    noise_dbfs: float = setting(
+        -35.0,
+        "In-band level of rotors and sensor noise at each microphone.",
+        unit="dBFS",
+        least=-120,
+        most=-3,
+    )
+    sensor_db: float = setting(
+        -10.0,
+        "Sensor noise, independent in each microphone, relative to the rotors.",
+        unit="dB",
+        least=-80,
+        most=40,
+    )
+    seed: int = setting(1, "Same seed, same sound.", least=0, most=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class CorrelationSettings:
+    """GCC-PHAT of all pairs."""
+
+    band_hz: tuple[float, ...] = setting(
+        (300.0, 4700.0), "Lowest and highest frequency used.", unit="Hz", least=1, most=48000
+    )
+    oversample: int = setting(
+        16, "Grid points per sample of lag; a parabola refines further.", unit="points", least=1, most=64
+    )
+    floor_dbfs: float = setting(
+        -120.0,
+        "Power of one frequency bin below which it fades out: silence gives zeros, not noise.",
+        unit="dBFS",
+        least=-200,
+        most=0,
+    )
+    relative_floor_db: float = setting(
+        -50.0,
+        "The same, relative to the mean bin of the frame: bins that the sound leaves empty do not count.",
+        unit="dB",
+        least=-120,
+        most=-1,
+    )
+
+
+@dataclass(frozen=True)
+class BearingSettings:
+    """From delays to a direction."""
+
+    estimator: str = setting(
+        "far-field",
+        "`far-field`: least squares over all pairs. `hyperbolic`: the paper's solver, with a position. "
+        "`two-mic`: arcsin of the first pair alone. `model:NAME`: a learned one from the models directory.",
+        pattern=rf"far-field|hyperbolic|two-mic|model:{NAME}",
+    )
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """When a sound counts as a call."""
+
+    snr_db: float = setting(
+        3.0, "In-band level over the tracked background from which a frame is a call.",
+        unit="dB", least=-20, most=60,
+    )  # fmt: skip
+    misfit: float = setting(
+        6.0, "Largest misfit of the delays with one far source.", unit="sigma", least=1, most=1000
+    )
+    background_s: float = setting(
+        6.0, "How slowly the background rises to a lasting new level.", unit="s", least=0.1, most=600
+    )
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Bearings over time."""
+
+    memory_s: float = setting(
+        1.0, "Time constant with which older bearings are forgotten.", unit="s", least=0.05, most=600
+    )
+    coast_s: float = setting(
+        2.0, "How long a track lives on after the last call.", unit="s", least=0.1, most=600
+    )
+
+
+@dataclass(frozen=True)
+class ModelsSettings:
+    """ONNX models."""
+
+    directory: str = setting(
+        "", "Where manifest.json and the models lie; empty: those that came with the program."
+    )
+
+
+@dataclass(frozen=True)
+class MavlinkSettings:
+    """The link to the flight controller or ground station."""
+
+    link: str = setting(
+        "udpout:127.0.0.1:14550",
+        "`udpout:HOST:PORT` sends there, `udpin:HOST:PORT` listens, `tcp:HOST:PORT` connects, "
+        "`serial:DEVICE:BAUD` opens a UART.",
+        pattern=r"(udpout|udpin|tcp):[^:\s]+:\d{1,5}|serial:[^:\s]+:\d{3,8}",
+    )
+    system_id: int = setting(
+        0,
+        "The vehicle's system id; 0: learnt from the autopilot's heartbeat (1 until then).",
+        least=0,
+        most=254,
+    )
+    component_id: int = setting(
+        191, "Our component id: 191 to 194 are for onboard computers.", least=191, most=194
+    )
+    rate_hz: float = setting(
+        2.0, "How often a bearing is sent while something calls.", unit="Hz", least=0.1, most=20
+    )
+
+
+@dataclass(frozen=True)
+class DaemonSettings:
+    """The service itself."""
+
+    queue_frames: int = setting(
+        8,
+        "Frames that may wait for the pipeline; beyond that the oldest is dropped and counted.",
+        unit="frames", least=1, most=1000,
+    )  # fmt: skip
+    stall_s: float = setting(
+        2.0,
+        "Without a frame for this long the source counts as lost: it is reopened, and no heartbeat is sent.",
+        unit="s", least=0.2, most=60,
+    )  # fmt: skip
+    backoff_s: float = setting(
+        10.0, "Longest wait between two attempts to reopen a source or a link.", unit="s", least=0.1, most=600
+    )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All settings. Every section and every key may be left out."""
+
+    array: ArraySettings = ArraySettings()
+    environment: EnvironmentSettings = EnvironmentSettings()
+    audio: AudioSettings = AudioSettings()
+    sim: SimSettings = SimSettings()
+    correlation: CorrelationSettings = CorrelationSettings()
+    bearing: BearingSettings = BearingSettings()
+    detection: DetectionSettings = DetectionSettings()
+    track: TrackSettings = TrackSettings()
+    models: ModelsSettings = ModelsSettings()
+    mavlink: MavlinkSettings = MavlinkSettings()
+    daemon: DaemonSettings = DaemonSettings()
+
+    def __post_init__(self) -> None:
+        faults = [*_faults_of_fields(self), *_faults_between_fields(self)]
+        if faults:
+            raise SettingsError("\n".join(faults))
+
+    @cached_property
+    def mic_array(self) -> MicArray:
+        return MicArray(np.array(self.array.positions_m, dtype=np.float64))
+
+    @property
+    def speed_m_s(self) -> float:
+        return speed_of_sound(self.environment.temperature_c)
+
+    @property
+    def hop_s(self) -> float:
+        return self.audio.hop / self.audio.rate_hz
+
+
+# --- the checks ---------------------------------------------------------------------------------------
+
+
+def _sections(settings: Settings) -> Iterator[tuple[str, Any]]:
+    for section in dataclasses.fields(settings):
+        yield section.name, getattr(settings, section.name)
+
+
+def _faults_of_fields(settings: Settings) -> Iterator[str]:
+    for name, section in _sections(settings):
+        for key in dataclasses.fields(section):
+            for fault in _faults_of_value(getattr(section, key.name), key.metadata):
+                yield f"{name}.{key.name}: {fault}"
+
+
+def _faults_of_value(value: Any, meta: Any) -> Iterator[str]:
+    if isinstance(value, tuple):
+        seen: set[str] = set()
+        for item in value:
+            seen.update(_faults_of_value(item, meta))
+        yield from sorted(seen)
+    elif isinstance(value, str):
+        if meta["choices"] and value not in meta["choices"]:
+            yield f"{value!r} is none of {', '.join(meta['choices'])}"
+        elif meta["pattern"] and not re.fullmatch(meta["pattern"], value):
+            yield f"{value!r} is not of the form that the manual gives: {meta['text']}"
+    elif not isinstance(value, bool):
+        unit = f" {meta['unit']}" if meta["unit"] else ""
+        if not math.isfinite(value):
+            yield f"{value} is not a finite number"
+        elif not meta["least"] <= value <= meta["most"]:
+            yield f"{value}{unit} is outside {meta['least']:g} to {meta['most']:g}{unit}"
+
+
+def _faults_between_fields(s: Settings) -> Iterator[str]:
+    yield from _faults_of_array(s)
+    if s.audio.frame & (s.audio.frame - 1):
+        yield f"audio.frame: {s.audio.frame} is not a power of two"
+    if s.audio.hop > s.audio.frame:
+        yield f"audio.hop: {s.audio.hop} is longer than audio.frame ({s.audio.frame})"
+    if len(set(s.audio.channel_map)) != len(s.audio.channel_map):
+        yield f"audio.channel_map: {list(s.audio.channel_map)} names a channel twice"
+    if len(s.audio.channel_map) != len(s.array.positions_m):
+        yield (
+            f"audio.channel_map: {len(s.audio.channel_map)} channels, "
+            f"but array.positions_m has {len(s.array.positions_m)} microphones"
+        )
+    if s.audio.source == "alsa" and max(s.audio.channel_map, default=0) >= s.audio.device_channels:
+        yield (
+            f"audio.channel_map: names channel {max(s.audio.channel_map)}, "
+            f"but audio.device_channels is {s.audio.device_channels} (counted from 0)"
+        )
+    if s.audio.source == "wav" and not s.audio.file:
+        yield "audio.file: is empty, but audio.source is wav"
+    band = s.correlation.band_hz
+    if len(band) != 2 or not band[0] < band[1]:
+        yield f"correlation.band_hz: {list(band)} is not a lowest and a highest frequency"
+    elif band[1] >= s.audio.rate_hz / 2:
+        yield f"correlation.band_hz: {band[1]:g} Hz is not below half of audio.rate_hz ({s.audio.rate_hz} Hz)"
+    elif (band[1] - band[0]) * s.audio.frame / s.audio.rate_hz < 8:
+        bin_hz = s.audio.rate_hz / s.audio.frame
+        yield f"correlation.band_hz: {list(band)} holds fewer than 8 bins of {bin_hz:.3g} Hz"
+
+
+def _faults_of_array(s: Settings) -> Iterator[str]:
+    key = "array.positions_m"
+    positions = s.array.positions_m
+    if any(len(row) != 3 for row in positions):
+        yield f"{key}: every row needs three numbers, x forward, y right, z down"
+        return
+    if not 2 <= len(positions) <= 8:
+        yield f"{key}: {len(positions)} microphones; 2 to 8 are possible"
+        return
+    if not all(math.isfinite(x) for row in positions for x in row):
+        return
+    array = MicArray(np.array(positions, dtype=np.float64))
+    for (i, j), spacing in zip(array.pairs, array.spacing_m, strict=True):
+        if spacing < 1e-3:
+            yield f"{key}: microphones {i} and {j} are at the same place"
+    if s.environment.temperature_c > -KELVIN:
+        longest = array.longest_delay_s(s.speed_m_s) * s.audio.rate_hz
+        if longest + 1 >= s.audio.frame / 4:
+            yield f"{key}: a longest delay of {longest:.0f} samples is too much for frames of {s.audio.frame}"
+    needs_plane = s.bearing.estimator in ("far-field", "hyperbolic")
+    if needs_plane and np.linalg.matrix_rank(array.baselines_m[:, :2], tol=1e-3) < 2:
+        yield (
+            f"{key}: seen from above the microphones are on one line, "
+            f"and bearing.estimator = {s.bearing.estimator!r} needs a plane"
+        )
+
+
+# --- reading ------------------------------------------------------------------------------------------
+
+
+def load(path: Path | str) -> Settings:
+    """Settings from a TOML file.
+
+    Raises `SettingsError` with one line per fault, each beginning with `section.key`.
+    """
+    try:
+        text = Path(path).read_bytes()
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        table = tomllib.loads(text.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: is not TOML: {error}") from error
+    return from_table(table)
+
+
+def from_table(table: dict[str, Any]) -> Settings:
+    """Settings from nested dictionaries as TOML gives them. Raises `SettingsError` like `load`."""
+    faults: list[str] = []
+    sections: dict[str, Any] = {}
+    known = {section.name: section for section in dataclasses.fields(Settings)}
+    kinds = typing.get_type_hints(Settings)
+    for name, content in table.items():
+        if name not in known:
+            faults.append(f"{name}: unknown section; known are {', '.join(known)}")
+        elif not isinstance(content, dict):
+            faults.append(f"{name}: is a section: write [{name}] and its keys below")
+        else:
+            sections[name] = _section(kinds[name], name, content, faults)
+    try:
+        settings = Settings(**sections)
+    except SettingsError as error:
+        faults += str(error).splitlines()
+    if faults:
+        raise SettingsError("\n".join(faults))
+    return settings
+
+
+def _section(kind: type, name: str, content: dict[str, Any], faults: list[str]) -> Any:
+    hints = typing.get_type_hints(kind)
+    values: dict[str, Any] = {}
+    for key, value in content.items():
+        if key not in hints:
+            faults.append(f"{name}.{key}: unknown key; known are {', '.join(hints)}")
+            continue
+        try:
+            values[key] = _convert(value, hints[key])
+        except TypeError:
+            faults.append(f"{name}.{key}: {value!r} is not {_in_words(hints[key])}")
+    return kind(**values)
+
+
+def _convert(value: Any, kind: Any) -> Any:
+    """TOML's value as the field's type; a whole number serves where a float is asked for."""
+    if isinstance(kind, types.GenericAlias) or typing.get_origin(kind) is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise TypeError
+        item = typing.get_args(kind)[0]
+        return tuple(_convert(v, item) for v in value)
+    if kind is float and type(value) in (int, float):
+        return float(value)
+    if type(value) is not kind:
+        raise TypeError
+    return value
+
+
+WORDS: dict[Any, str] = {str: "a text", int: "a whole number", float: "a number", bool: "true or false"}
+
+
+def _in_words(kind: Any) -> str:
+    if kind in WORDS:
+        return WORDS[kind]
+    return f"a list, each item {_in_words(typing.get_args(kind)[0])}"
+
+
+# --- the sample file ----------------------------------------------------------------------------------
+
+
+def sample() -> str:
+    """The sample file: every section and key with its sentence, unit, range and default."""
+    lines = [
+        "# Settings of locagen-edge. Every key may be left out; what stands here are the defaults.",
+        "# Check a changed file with: locagen-edge check --settings FILE",
+    ]
+    for name, section in _sections(Settings()):
+        lines += ["", f"# {(type(section).__doc__ or '').strip()}", f"[{name}]"]
+        for key in dataclasses.fields(section):
+            lines += _wrapped(key.metadata["text"] + _limits(key.metadata))
+            lines.append(f"{key.name} = {_toml(getattr(section, key.name))}")
+    return "\n".join(lines) + "\n"
+
+
+def _limits(meta: Any) -> str:
+    parts = [meta["unit"]] if meta["unit"] else []
+    if math.isfinite(meta["least"]):
+        parts.append(f"{meta['least']:.10g} to {meta['most']:.10g}")
+    if meta["choices"]:
+        parts.append(" | ".join(meta["choices"]))
+    return f" ({', '.join(parts)})" if parts else ""
+
+
+def _wrapped(text: str, width: int = 108) -> list[str]:
+    return textwrap.wrap(text, width, initial_indent="# ", subsequent_indent="# ")
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, tuple) and value and isinstance(value[0], tuple):
+        return "[\n" + "".join(f"    {_toml(row)},\n" for row in value) + "]"
+    formats: dict[type, Callable[[Any], str]] = {
+        bool: lambda v: "true" if v else "false",
+        str: lambda v: '"' + v + '"',
+        tuple: lambda v: "[" + ", ".join(_toml(item) for item in v) + "]",
+    }
+    return formats.get(type(value), repr)(value)
+
+
+if __name__ == "__main__":
+    print(sample(), end="")

@@ -1,0 +1,147 @@
+"""What travels along the way, in the order of travel.
+
+    Frame -> Correlation -> Tdoa -> Bearing -> Track        (Detection and faults beside them)
+
+Each type carries its own time and rate, so that no stage has to ask another for them. All are frozen;
+arrays inside are not to be written to. Conventions of axes, signs and units: CONTRIBUTING.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Where the source really was at a frame's middle: known only to a simulation."""
+
+    azimuth_rad: float
+    elevation_rad: float
+    range_m: float
+    calling: bool
+    """whether the source sounds in this frame"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A piece of sound from all microphones."""
+
+    samples: F32
+    """(mics, samples), full scale 1.0"""
+    rate_hz: float
+    t_ns: int
+    """monotonic time of the first sample, ns"""
+    start: int
+    """number of the first sample since the source was opened; frames overlap by the frame less the hop"""
+    overruns: int = 0
+    """times that sound was lost between the previous frame and this one's end"""
+    truth: Truth | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correlation:
+    """GCC-PHAT of every pair, on a sub-sample grid of the lags that the geometry allows."""
+
+    values: F32
+    """(pairs, lags); 1.0 is full coherence over the whole band"""
+    lag_s: F64
+    """(lags,) seconds; positive: the pair's second microphone hears later"""
+    power: F32
+    """(mics,) mean square in the band, full scale 1.0"""
+    bad_mics: int
+    """bit m set: microphone m held a sample that is not finite, and counts as silent"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tdoa:
+    """Time differences of arrival of all pairs."""
+
+    delay_s: F64
+    """(pairs,) t_j - t_i, seconds; NaN where a pair has no peak"""
+    sigma_s: F64
+    """(pairs,) 1-sigma of the delay, seconds; infinite where there is no peak"""
+    peak: F64
+    """(pairs,) height of the peak, 0 to 1"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """A position in body axes from hyperbolic TDOA, with what it is worth."""
+
+    position_m: F64
+    """(3,) x forward, y right, z down; z is 0 by assumption where the array is flat"""
+    covariance_m2: F64
+    """(3, 3)"""
+    range_m: float
+    range_sigma_m: float
+    range_observable: bool
+    """False: the delays do not bound the range, and only the direction means anything"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bearing:
+    """Where the sound of one frame comes from. None instead of an angle: nothing can be said."""
+
+    azimuth_rad: float | None
+    """body axes: 0 ahead, positive clockwise seen from above, -pi to pi"""
+    azimuth_sigma_rad: float
+    elevation_rad: float | None
+    """positive up; None where the array cannot tell"""
+    elevation_sigma_rad: float
+    misfit: float
+    """rms of (measured - fitted) delay over its sigma; about 1 when one far source explains all pairs"""
+    estimator: str
+    fix: Fix | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """Whether something calls."""
+
+    call: bool
+    snr_db: float
+    """in-band, mean of the live microphones, over the tracked background"""
+    level_dbfs: float
+    """in-band level, mean of the live microphones"""
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The bearing of one caller over time, body axes."""
+
+    azimuth_rad: float
+    azimuth_sigma_rad: float
+    elevation_rad: float | None
+    elevation_sigma_rad: float
+    age_s: float
+    """since the call was first heard"""
+    silent_s: float
+    """since the call was last heard"""
+    confidence: float
+    """0 to 1: share of the recent frames that held a call and agreed with the track"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """All that the pipeline says of one frame."""
+
+    t_ns: int
+    start: int
+    overruns: int
+    tdoa: Tdoa
+    bearing: Bearing
+    detection: Detection
+    track: Track | None
+    faults: tuple[str, ...]
+    """what is wrong with the microphones now, in words for the operator"""
+    truth: Truth | None = None
+
+
+Array = npt.NDArray[Any]
