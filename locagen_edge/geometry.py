@@ -17,6 +17,9 @@ from locagen_edge.types import F64
 
 KELVIN = 273.15
 
+LAG_MARGIN_SAMPLES = 0.25
+"""Noise moves the peak of a source in line with a pair beyond the longest delay: look a little further."""
+
 
 def speed_of_sound(temperature_c: float) -> float:
     """Speed of sound in dry air, m/s: 331.3 sqrt(1 + T / 273.15).
@@ -106,3 +109,14 @@ def equilateral(side_m: float = 0.10) -> MicArray:
     radius = side_m / math.sqrt(3.0)
     azimuths = np.radians([0.0, 120.0, 240.0])
     return MicArray(np.stack([radius * np.cos(azimuths), radius * np.sin(azimuths), np.zeros(3)], axis=1))
+
+
+def tolerance_rad(array: MicArray, tolerance_m: float) -> float:
+    """1-sigma of the azimuth of a source on the horizon from position errors alone, worst direction.
+
+    Position errors of 1-sigma `tolerance_m` per axis and microphone, independent: least squares gives
+    tolerance / sqrt(sum_m (p_m . v)^2), v across the bearing; the worst v is the smallest eigenvalue's.
+    """
+    flat = array.positions_m[:, :2] - array.positions_m[:, :2].mean(axis=0)
+    spread = float(np.linalg.eigvalsh(flat.T @ flat)[0])
+    return tolerance_m / math.sqrt(spread) if spread > 1e-9 else math.pi

@@ -229,8 +229,13 @@ class DetectionSettings:
 class TrackSettings:
     """Bearings over time."""
 
-    memory_s: float = setting(
-        1.0, "Time constant with which older bearings are forgotten.", unit="s", least=0.05, most=600
+    agility_deg_s2: float = setting(
+        10.0,
+        "How briskly a bearing changes its rate, per square root of a second: a drone that turns, a caller "
+        "who is passed. Less is smoother and lags more.",
+        unit="degrees/s2",
+        least=0.1,
+        most=1000,
     )
     coast_s: float = setting(
         2.0, "How long a track lives on after the last call.", unit="s", least=0.1, most=600

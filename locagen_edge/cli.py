@@ -1,0 +1,330 @@
+"""The command line: the only place that prints for people and exits.
+
+Exit codes: 0 done, 1 a failure said in one line, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import logging
+import math
+import os
+import signal
+import statistics
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from locagen_edge import __version__
+from locagen_edge.errors import LocagenError, SettingsError
+from locagen_edge.geometry import compass_deg
+from locagen_edge.settings import DEFAULT_PATH, Settings, load
+from locagen_edge.types import Estimate
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point of `locagen-edge`."""
+    arguments = _parser().parse_args(argv)
+    level = logging.DEBUG if arguments.verbose else logging.INFO
+    logging.basicConfig(level=level, format="%(levelname).1s %(message)s", stream=sys.stderr)
+    try:
+        code = arguments.command(arguments)
+    except SettingsError as error:
+        for line in str(error).splitlines():
+            print(f"locagen-edge: {line}", file=sys.stderr)
+        code = 1
+    except LocagenError as error:
+        print(f"locagen-edge: {error}", file=sys.stderr)
+        code = 1
+    except BrokenPipeError:  # `| head` has seen enough: not a failure, and nothing may be written any more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    except KeyboardInterrupt:
+        code = 130
+    sys.exit(code)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="locagen-edge",
+        description="Hears a call for help with a small microphone array and tells where it comes from.",
+        epilog="Exit codes: 0 done, 1 a failure said in one line, 2 wrong usage.",
+    )
+    parser.add_argument("--version", action="version", version=f"locagen-edge {__version__}")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("-v", "--verbose", action="store_true", help="say more on the error stream")
+    common.add_argument(
+        "--settings",
+        type=Path,
+        metavar="FILE",
+        help=f"TOML settings (default: {DEFAULT_PATH} where it exists, else the built-in defaults)",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name: str, function: Callable[[argparse.Namespace], int], text: str, more: str) -> Any:
+        sub = commands.add_parser(
+            name,
+            parents=[common],
+            help=text,
+            description=f"{text[0].upper()}{text[1:]}. {more}",
+        )
+        sub.set_defaults(command=function)
+        return sub
+
+    run = command(
+        "run",
+        _run,
+        "listen, and send bearings over MAVLink until stopped",
+        "Prints one line per second: time, bearing in degrees clockwise from ahead with its 1-sigma, "
+        "elevation, the true bearing where a simulation knows it, SNR, and what was sent. "
+        "SIGINT or SIGTERM ends it within a second.",
+    )
+    run.add_argument("--seconds", type=_positive, metavar="N", help="stop after N seconds")
+    run.add_argument("--quiet", action="store_true", help="no line per second (under a service manager)")
+
+    replay = command(
+        "replay",
+        _replay,
+        "run a recording through the same pipeline, faster than real time",
+        "One line per hop on standard output. t_s is the time of the frame's first sample; azimuth_deg is "
+        "clockwise from ahead, 0 to 360; elevation_deg is positive up; sigma_deg is the azimuth's 1-sigma; "
+        "null means that nothing can be said. The estimate is given whether or not `call` is true.",
+    )
+    replay.add_argument("file", type=Path, metavar="FILE.wav", help="WAV or FLAC, any rate and channel count")
+    replay.add_argument(
+        "--format", choices=("jsonl", "table"), default="jsonl", help="JSON lines (default) or a table"
+    )
+
+    command("devices", _devices, "list the capture devices", "The name is what audio.device looks for.")
+    check = command(
+        "check",
+        _check,
+        "check settings, models, microphones and link, and say what to do",
+        "Listens to the source of the settings for some seconds. Exit code 1 where anything is wrong.",
+    )
+    check.add_argument(
+        "--seconds", type=_positive, default=2.0, metavar="N", help="how long to listen (default 2)"
+    )
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text} is not a number above zero")
+    return value
+
+
+def _settings(arguments: argparse.Namespace) -> Settings:
+    if arguments.settings is not None:
+        return load(arguments.settings)
+    return load(DEFAULT_PATH) if DEFAULT_PATH.exists() else Settings()
+
+
+# --- run ----------------------------------------------------------------------------------------------
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    settings = _settings(arguments)
+    asyncio.run(_serve(settings, arguments.seconds, quiet=arguments.quiet))
+    return 0
+
+
+async def _serve(settings: Settings, seconds: float | None, *, quiet: bool) -> None:
+    from locagen_edge.daemon import Daemon
+
+    live = LiveLine()
+    daemon = Daemon(settings, on_second=None if quiet else live)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, daemon.stop)
+    if not quiet:
+        print(
+            f"locagen-edge {__version__}: {settings.audio.source} source, "
+            f"{settings.bearing.estimator} estimator, MAVLink to {settings.mavlink.link}; Ctrl-C ends",
+            flush=True,
+        )
+    await daemon.startup()
+    try:
+        if seconds is not None:
+            loop.call_later(seconds, daemon.stop)
+        await daemon.main_loop()
+    finally:
+        await daemon.shutdown()
+    if not quiet:
+        c = daemon.counters
+        print(
+            f"{c.estimates} frames, {c.dropped} dropped, {c.overruns} overruns, "
+            f"{c.source_failures} source failures; sent {_counts(daemon.component.sent)}"
+        )
+
+
+class LiveLine:
+    """One line per second for a person who watches."""
+
+    def __init__(self) -> None:
+        self._second = 0
+        self._sent: Counter[str] = Counter()
+
+    def __call__(self, daemon: Any) -> None:
+        self._second += 1
+        sent = Counter(daemon.component.sent)
+        news, self._sent = sent - self._sent, sent
+        link = "up" if daemon.link.up else "down"
+        if not daemon.hearing or daemon.estimate is None:
+            print(
+                f"{self._second:5d} s  no sound: {daemon.source_fault or 'waiting'}  link {link}", flush=True
+            )
+            return
+        latency = daemon.counters.latency_s
+        delay = f"  {1e3 * statistics.median(latency):.1f} ms" if latency else ""
+        print(
+            f"{self._second:5d} s  {describe(daemon.estimate)}{delay}  link {link}, sent {_counts(news)}",
+            flush=True,
+        )
+
+
+def describe(estimate: Estimate) -> str:
+    """One frame's estimate in words: the track's bearing, and the truth beside it where it is known."""
+    track, truth = estimate.track, estimate.truth
+    parts = [f"{'CALL ' if estimate.detection.call else 'quiet'} snr {estimate.detection.snr_db:5.1f} dB"]
+    if track is None:
+        parts.append("bearing  --- ")
+    else:
+        azimuth, sigma = compass_deg(track.azimuth_rad), math.degrees(track.azimuth_sigma_rad)
+        parts.append(f"bearing {azimuth:5.1f}° ±{sigma:.1f}°")
+        if track.elevation_rad is not None:
+            parts.append(f"elevation {math.degrees(track.elevation_rad):.0f}°")
+    if truth is not None:
+        parts.append(f"true {compass_deg(truth.azimuth_rad):5.1f}°")
+    parts += [f"! {fault}" for fault in estimate.faults]
+    return "  ".join(parts)
+
+
+def _counts(counter: Counter[str]) -> str:
+    return ", ".join(f"{n} {name}" for name, n in sorted(counter.items())) or "nothing"
+
+
+# --- replay -------------------------------------------------------------------------------------------
+
+COLUMNS: dict[str, str] = {
+    "t_s": "9.3f",
+    "azimuth_deg": "11.2f",
+    "sigma_deg": "9.2f",
+    "elevation_deg": "13.2f",
+    "elevation_sigma_deg": "19.2f",
+    "snr_db": "7.1f",
+    "call": "6",
+    "track_deg": "9.2f",
+    "track_sigma_deg": "15.2f",
+    "misfit": "8.2f",
+    "range_m": "8.2f",
+    "estimator": "12",
+    "faults": "",
+}
+"""What one line of `replay` holds, and how the table prints it."""
+
+
+def record(estimate: Estimate, t_s: float) -> dict[str, Any]:
+    """One hop as plain values, keys as in COLUMNS; None where nothing can be said."""
+    b, track, fix = estimate.bearing, estimate.track, estimate.bearing.fix
+    return {
+        "t_s": round(t_s, 6),
+        "azimuth_deg": None if b.azimuth_rad is None else round(compass_deg(b.azimuth_rad), 4),
+        "sigma_deg": round(math.degrees(b.azimuth_sigma_rad), 4),
+        "elevation_deg": None if b.elevation_rad is None else round(math.degrees(b.elevation_rad), 4),
+        "elevation_sigma_deg": round(math.degrees(b.elevation_sigma_rad), 4),
+        "snr_db": round(estimate.detection.snr_db, 2),
+        "call": estimate.detection.call,
+        "track_deg": None if track is None else round(compass_deg(track.azimuth_rad), 4),
+        "track_sigma_deg": None if track is None else round(math.degrees(track.azimuth_sigma_rad), 4),
+        "misfit": round(b.misfit, 3) if math.isfinite(b.misfit) else None,
+        "range_m": round(fix.range_m, 3) if fix is not None and fix.range_observable else None,
+        "estimator": b.estimator,
+        "faults": list(estimate.faults),
+    }
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    settings = _settings(arguments)
+    if arguments.format == "table":
+        print("  ".join(f"{name:>{_width(name)}}" for name in COLUMNS))
+    for line in replay(arguments.file, settings):
+        print(json.dumps(line) if arguments.format == "jsonl" else _row(line))
+    sys.stdout.flush()
+    return 0
+
+
+def replay(path: Path, settings: Settings) -> Iterator[dict[str, Any]]:
+    """The records of a recording, hop by hop, with a progress bar where the error stream is a terminal
+    and the records go elsewhere."""
+    from tqdm import tqdm
+
+    from locagen_edge.pipeline import Pipeline
+    from locagen_edge.stages.mic import wav_duration_s, wav_frames
+
+    pipeline = Pipeline(settings)
+    rate_hz, frame_s = settings.audio.rate_hz, settings.audio.frame / settings.audio.rate_hz
+    bar = tqdm(
+        total=round(wav_duration_s(path), 1),
+        unit="s",
+        desc=path.name,
+        disable=not sys.stderr.isatty() or sys.stdout.isatty(),
+        bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s of sound, {elapsed} so far",
+    )
+    with bar:
+        for frame in wav_frames(path, settings):
+            t_s = frame.start / rate_hz
+            bar.update(t_s + frame_s - bar.n)
+            yield record(pipeline.process(frame), t_s)
+
+
+def _width(name: str) -> int:
+    return int(COLUMNS[name].partition(".")[0] or 0)
+
+
+def _row(line: dict[str, Any]) -> str:
+    cells = []
+    for name, form in COLUMNS.items():
+        value = line[name]
+        if isinstance(value, float):
+            cells.append(f"{value:{form}}")
+        else:
+            text = "; ".join(value) if isinstance(value, list) else "-" if value is None else str(value)
+            cells.append(f"{text:>{_width(name)}}")
+    return "  ".join(cells)
+
+
+# --- devices ------------------------------------------------------------------------------------------
+
+
+def _devices(arguments: argparse.Namespace) -> int:
+    from locagen_edge.stages.mic import devices
+
+    found = devices()
+    if not found:
+        print("no capture device: plug one in, and see `arecord -l` for what the kernel knows")
+    for device in found:
+        print(
+            f"{device.name!r}: {device.channels} channels, default {device.default_rate_hz:g} Hz ({device.host_api})"
+        )
+    return 0
+
+
+# --- check --------------------------------------------------------------------------------------------
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from locagen_edge.check import check
+
+    wrong = 0
+    for good, what, text in check(_settings(arguments), arguments.seconds):
+        print(f"{'ok   ' if good else 'WRONG'}  {what}: {text}", flush=True)
+        wrong += not good
+    if wrong:
+        print(f"{wrong} of these need you")
+    return 1 if wrong else 0

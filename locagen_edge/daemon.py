@@ -1,0 +1,225 @@
+"""The daemon: asyncio around the pipeline.
+
+    source -> bounded queue (oldest dropped, drops counted) -> pipeline in one worker thread -> MAVLink
+
+Startup, main loop and shutdown are methods that a test can call. A source that fails is reopened with
+bounded back-off while the link goes on, and the link (which reopens itself) never holds up the sound. What
+is told (heartbeat, watchdog, status) follows from when the last frame was heard, never from hope.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+from locagen_edge.errors import SourceError
+from locagen_edge.mavlink.component import Component, Status
+from locagen_edge.mavlink.link import Link
+from locagen_edge.notify import notify
+from locagen_edge.pipeline import Pipeline
+from locagen_edge.settings import Settings
+from locagen_edge.sources import open_source
+from locagen_edge.types import Estimate, Frame
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.1
+"""How often what is due is sent: a tenth of the heartbeat's period."""
+FIRST_WAIT_S = 0.5
+DRAIN_S = 0.5
+"""How long shutdown waits for frames already in the queue; all of it has to end within a second."""
+
+
+@dataclass
+class Counters:
+    """What happened since the start; every loss is in here."""
+
+    frames: int = 0
+    estimates: int = 0
+    dropped: int = 0
+    """frames that the queue had no room for"""
+    overruns: int = 0
+    """times that the source lost sound"""
+    source_failures: int = 0
+    latency_s: list[float] = field(default_factory=list)
+    """of the last second: from a frame's last sample to its estimate"""
+
+
+class Daemon:
+    """One source, one pipeline, one link.
+
+    `on_second(daemon)` is called once per second of the main loop. `sources` opens the source that the
+    settings name; a test passes its own.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        on_second: Callable[[Daemon], None] | None = None,
+        sources: Callable[[Settings], AsyncIterator[Frame]] = open_source,
+    ):
+        self.settings = settings
+        self.counters = Counters()
+        self.estimate: Estimate | None = None
+        self.source_fault = ""
+        self._on_second = on_second
+        self._sources = sources
+        self._stopping = asyncio.Event()
+        self._queue: asyncio.Queue[Frame | None] = asyncio.Queue()
+        self._heard_s = -float("inf")
+        self._tasks: list[asyncio.Task[None]] = []
+        self._ready = False
+
+    async def startup(self) -> None:
+        """Makes pipeline and link. Raises `LocagenError` where the settings cannot be flown with."""
+        self.component = Component(self.settings.mavlink)
+        self.link = Link(
+            self.settings.mavlink.link,
+            backoff_s=self.settings.daemon.backoff_s,
+            on_bytes=lambda data: self.component.receive(data, time.monotonic()),
+        )
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="pipeline")
+        # models load in the worker: the event loop stays free, and they belong to the thread that calls
+        loop = asyncio.get_running_loop()
+        self.pipeline = await loop.run_in_executor(self._executor, Pipeline, self.settings)
+        self._tasks = [
+            asyncio.create_task(self.link.run(), name="link"),
+            asyncio.create_task(self._capture(), name="capture"),
+            asyncio.create_task(self._work(), name="work"),
+            asyncio.create_task(self._tick(), name="tick"),
+        ]
+        notify(STATUS="waiting for the first sound")
+
+    async def main_loop(self) -> None:
+        """Runs until `stop` is called or the source ends. Raises what a task of the daemon raised."""
+        stopping = asyncio.create_task(self._stopping.wait(), name="stopping")
+        try:
+            done, _ = await asyncio.wait([stopping, *self._tasks], return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            stopping.cancel()
+
+    def stop(self) -> None:
+        """Asks the main loop to end: safe to call from a signal handler of the loop."""
+        self._stopping.set()
+
+    async def shutdown(self) -> None:
+        """Stops the source, drains the queue, closes the link. Ends within a second."""
+        notify(STOPPING="1", STATUS="stopping")
+        tasks = {task.get_name(): task for task in self._tasks}
+        await _cancelled(tasks["capture"])
+        self._queue.put_nowait(None)
+        await asyncio.wait([tasks["work"]], timeout=DRAIN_S)
+        self._send()
+        await _cancelled(*self._tasks)
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+    # --- source -> queue
+
+    async def _capture(self) -> None:
+        wait_s = FIRST_WAIT_S
+        while True:
+            heard = self.counters.frames
+            try:
+                await self._read_source()
+            except SourceError as error:
+                if error.fatal:
+                    raise
+                self.counters.source_failures += 1
+                if str(error) != self.source_fault:
+                    log.error("%s", error)
+                self.source_fault = str(error)
+            else:  # a recording's end
+                self._queue.put_nowait(None)
+                await asyncio.Event().wait()
+            wait_s = FIRST_WAIT_S if self.counters.frames > heard else wait_s * 2.0
+            wait_s = min(wait_s, self.settings.daemon.backoff_s)
+            log.info("the source is opened again in %.1f s", wait_s)
+            await asyncio.sleep(wait_s)
+
+    async def _read_source(self) -> None:
+        """Frames into the queue until the source ends. Raises `SourceError` where it fails or stalls."""
+        async with contextlib.aclosing(self._sources(self.settings)) as source:  # type: ignore[type-var]
+            while True:
+                try:
+                    async with asyncio.timeout(self.settings.daemon.stall_s):
+                        frame = await anext(source)
+                except TimeoutError:
+                    stall_s = self.settings.daemon.stall_s
+                    raise SourceError(f"no sound for {stall_s:g} s: the source has stalled") from None
+                except StopAsyncIteration:
+                    return
+                self._heard_s = time.monotonic()
+                self.counters.frames += 1
+                self.counters.overruns += frame.overruns
+                if self.source_fault:
+                    log.warning("sound again")
+                    self.source_fault = ""
+                if self._queue.qsize() >= self.settings.daemon.queue_frames:
+                    self._queue.get_nowait()
+                    self.counters.dropped += 1
+                self._queue.put_nowait(frame)
+
+    # --- queue -> pipeline -> link
+
+    async def _work(self) -> None:
+        loop = asyncio.get_running_loop()
+        frame_ns = round(self.settings.audio.frame / self.settings.audio.rate_hz * 1e9)
+        while (frame := await self._queue.get()) is not None:
+            self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame)
+            self.counters.estimates += 1
+            self.counters.latency_s.append((time.monotonic_ns() - frame.t_ns - frame_ns) * 1e-9)
+            self._send()
+            if not self._ready:
+                self._ready = notify(READY="1", STATUS="listening")
+
+    @property
+    def hearing(self) -> bool:
+        """Whether sound flows now: heartbeat and watchdog depend on it."""
+        return time.monotonic() - self._heard_s < self.settings.daemon.stall_s
+
+    def _send(self) -> None:
+        estimate = self.estimate
+        status = Status(
+            hearing=self.hearing,
+            track=estimate.track if estimate and self.hearing else None,
+            snr_db=estimate.detection.snr_db if estimate else 0.0,
+            faults=estimate.faults if estimate and self.hearing else (),
+        )
+        for message in self.component.due(time.monotonic(), status):
+            self.link.send(message)
+
+    async def _tick(self) -> None:
+        """What is due without a new estimate; once a second the status and the watchdog."""
+        next_s = time.monotonic() + 1.0
+        while True:
+            await asyncio.sleep(TICK_S)
+            self._send()
+            if time.monotonic() < next_s:
+                continue
+            next_s += 1.0
+            if self._on_second is not None:
+                self._on_second(self)
+            if self.hearing:
+                notify(WATCHDOG="1", STATUS=self._in_words())
+            else:
+                notify(STATUS=f"no sound: {self.source_fault or 'waiting'}")
+            self.counters.latency_s.clear()
+
+    def _in_words(self) -> str:
+        c = self.counters
+        return f"listening; {c.estimates} frames, {c.dropped} dropped, {c.overruns} overruns"
+
+
+async def _cancelled(*tasks: asyncio.Task[None]) -> None:
+    """Cancels tasks and waits until they have ended, whatever they end with."""
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)

@@ -1,0 +1,52 @@
+"""What all estimators share: the answer "nothing", the geometry, and how errors of delays go together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from locagen_edge.geometry import MicArray
+from locagen_edge.settings import Settings
+from locagen_edge.types import F64, Bearing, Tdoa
+
+Estimator = Callable[[Tdoa], Bearing]
+
+NOWHERE_RAD = math.pi / math.sqrt(3.0)
+"""1-sigma of an angle that may be anything: the standard deviation of a uniform one, 104 degrees."""
+
+
+def no_bearing(estimator: str) -> Bearing:
+    """The answer where the delays say nothing: silence, or too few live microphones."""
+    return Bearing(None, NOWHERE_RAD, None, NOWHERE_RAD, math.inf, estimator)
+
+
+@dataclass(frozen=True, eq=False)
+class DelayModel:
+    """The array, and the errors of its delays."""
+
+    array: MicArray
+    speed_m_s: float
+    tolerance_s: float
+    """1-sigma of a pair's delay from the microphones' positions"""
+
+    @staticmethod
+    def of(settings: Settings) -> DelayModel:
+        speed = settings.speed_m_s
+        return DelayModel(settings.mic_array, speed, math.sqrt(2.0) * settings.array.tolerance_m / speed)
+
+    @property
+    def correlation(self) -> F64:
+        """(pairs, pairs): two pairs that share a microphone share half of their error (+ or -)."""
+        incidence = np.zeros((len(self.array.pairs), self.array.mics))
+        for row, (i, j) in enumerate(self.array.pairs):
+            incidence[row, i], incidence[row, j] = -1.0, 1.0
+        half: F64 = incidence @ incidence.T / 2.0
+        return half
+
+    def sigma_s(self, tdoa: Tdoa) -> F64:
+        """(pairs,) 1-sigma of the delays with the tolerance of the positions in it."""
+        total: F64 = np.hypot(tdoa.sigma_s, self.tolerance_s)
+        return total

@@ -1,0 +1,145 @@
+"""The paper's solver: the position that explains the delays against the base microphone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from locagen_edge.geometry import direction, wrap
+from locagen_edge.settings import Settings
+from locagen_edge.stages.bearing.common import NOWHERE_RAD, DelayModel, Estimator, no_bearing
+from locagen_edge.stages.bearing.far_field import far_field
+from locagen_edge.types import F64, Bearing, Fix, Tdoa
+
+STARTS_M = (0.3, 3.0, 100.0)
+"""Ranges from which the minimiser starts; the directions are the far field's and its opposite."""
+
+FARTHEST_M = 1e4
+"""Where the search ends: beyond a kilometre a curved wave differs from a plane one by nanoseconds."""
+
+
+def hyperbolic(settings: Settings) -> Estimator:
+    """The paper's solver: the position whose range differences to the base microphone fit best.
+
+    Minimises sum_m ((d_m - d_1) - c tau_1m)^2 over positions, d_m the distance to microphone m, by
+    Levenberg-Marquardt (Nocedal & Wright, *Numerical Optimization*, section 10.3) in direction and inverse
+    range, in which far sources are as well-behaved as near ones (Civera, Davison & Montiel, "Inverse depth
+    parametrization for monocular SLAM", IEEE Trans. Robotics 24, 2008). A flat array gives x and y in its
+    own height, so a source far below is taken for a nearer one: the far field gives the better elevation.
+    """
+    model = DelayModel.of(settings)
+    array, speed = model.array, model.speed_m_s
+    base = [row for row, (i, _) in enumerate(array.pairs) if i == 0]
+    others = array.positions_m[1:]
+    solid = array.dimensions == 3
+    plane_wave = far_field(settings)
+    correlation = model.correlation[np.ix_(base, base)]
+    centre = array.positions_m.mean(axis=0)
+    nearest = float(np.linalg.norm(array.positions_m - centre, axis=1).max()) * 1.05
+
+    def place(q: F64) -> F64:
+        u = direction(q[0], q[1] if solid else 0.0)
+        position: F64 = centre + u / min(max(q[-1], 1.0 / FARTHEST_M), 1.0 / nearest)
+        return position
+
+    def differences(q: F64) -> F64:
+        at = place(q)
+        farther: F64 = np.linalg.norm(others - at, axis=1) - np.linalg.norm(array.positions_m[0] - at)
+        return farther
+
+    def estimate(tdoa: Tdoa) -> Bearing:
+        wanted = tdoa.delay_s[base] * speed
+        start = plane_wave(tdoa)
+        if not np.isfinite(wanted).all() or start.azimuth_rad is None:
+            return no_bearing("hyperbolic")
+        sigma = model.sigma_s(tdoa)[base] * speed
+        cost, q, jacobian = min(
+            (
+                _levenberg_marquardt(differences, wanted, np.array([*angle, 1.0 / range_m]))
+                for angle in _start_angles(start, solid)
+                for range_m in STARTS_M
+            ),
+            key=lambda found: found[0],
+        )
+        noise = correlation * np.outer(sigma, sigma)
+        gain = np.linalg.pinv(jacobian)
+        return _from_position(q, place(q), gain @ noise @ gain.T, math.sqrt(cost), sigma, start, solid)
+
+    return estimate
+
+
+def _start_angles(start: Bearing, solid: bool) -> list[tuple[float, ...]]:
+    azimuth = start.azimuth_rad or 0.0
+    if solid:
+        return [(azimuth, start.elevation_rad or 0.0)]
+    return [(azimuth,), (azimuth + math.pi,)]
+
+
+def _levenberg_marquardt(
+    f: Callable[[F64], F64], wanted: F64, q: F64, steps: int = 30
+) -> tuple[float, F64, F64]:
+    """Minimises |f(q) - wanted|^2 from q. Returns the cost, q and the Jacobian there."""
+    damping, residual = 1e-3, f(q) - wanted
+    cost = float(residual @ residual)
+    jacobian = _jacobian(f, q)
+    for _ in range(steps):
+        hessian = jacobian.T @ jacobian
+        scale = np.diag(np.maximum(np.diag(hessian), 1e-12))
+        step = np.linalg.solve(hessian + damping * scale, -jacobian.T @ residual)
+        trial = q + step
+        trial[-1] = abs(trial[-1])
+        trial_residual = f(trial) - wanted
+        trial_cost = float(trial_residual @ trial_residual)
+        if trial_cost < cost:
+            small = cost - trial_cost < 1e-18  # (nanometre)^2
+            q, residual, cost, damping = trial, trial_residual, trial_cost, damping / 10.0
+            jacobian = _jacobian(f, q)
+            if small:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e9:
+                break
+    return cost, q, jacobian
+
+
+def _jacobian(f: Callable[[F64], F64], q: F64) -> F64:
+    """Central differences; 1e-6 rad and 1e-6 / m move a 10 cm array's range differences by 0.1 um."""
+    step = 1e-6
+    columns = []
+    for k in range(len(q)):
+        move = np.zeros_like(q)
+        move[k] = step
+        columns.append((f(q + move) - f(q - move)) / (2.0 * step))
+    return np.stack(columns, axis=1)
+
+
+def _from_position(
+    q: F64, position: F64, covariance: F64, residual_m: float, sigma_m: F64, start: Bearing, solid: bool
+) -> Bearing:
+    """Angles, range and what they are worth, from direction and inverse range with their covariance."""
+    inverse, inverse_sigma = float(q[-1]), math.sqrt(max(float(covariance[-1, -1]), 0.0))
+    range_m = 1.0 / min(max(inverse, 1.0 / FARTHEST_M), 1e3)
+    # to first order; where the inverse range is not three sigmas from zero, that theory has no meaning
+    observable = inverse > 3.0 * inverse_sigma and inverse > 1.0 / FARTHEST_M
+    range_sigma = inverse_sigma * range_m**2
+    azimuth = wrap(float(q[0]))
+    elevation = float(q[1]) if solid else 0.0
+    u = direction(azimuth, elevation)
+    across = direction(azimuth + math.pi / 2) * math.cos(elevation) * range_m
+    up = np.array([-u[2] * -math.cos(azimuth), -u[2] * -math.sin(azimuth), -math.cos(elevation)]) * range_m
+    columns = [across, up, -u * range_m**2] if solid else [across, -u * range_m**2]
+    turn = np.stack(columns, axis=1)
+    return Bearing(
+        azimuth_rad=azimuth,
+        azimuth_sigma_rad=min(math.sqrt(max(float(covariance[0, 0]), 0.0)), NOWHERE_RAD),
+        elevation_rad=elevation if solid else None,
+        elevation_sigma_rad=(
+            min(math.sqrt(max(float(covariance[1, 1]), 0.0)), NOWHERE_RAD) if solid else NOWHERE_RAD
+        ),
+        misfit=max(start.misfit, residual_m / float(np.linalg.norm(sigma_m))),
+        estimator="hyperbolic",
+        fix=Fix(position, turn @ covariance @ turn.T, range_m, range_sigma, observable),
+    )

@@ -1,0 +1,92 @@
+"""Frame, Correlation and Bearing -> what is wrong with the microphones, in words for the operator.
+
+Each symptom is one line of a table: a test that says, per frame, for which microphones it holds. A symptom
+becomes a fault once it has held for most of a second, and is forgotten as slowly.
+
+What signals cannot show: two swapped microphones of an equilateral triangle mirror every bearing, and
+each mirrored bearing fits as well as the true one. Only a sound from a known direction tells them apart.
+Arrays without that symmetry do show a swap: the delays then fit no direction.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from locagen_edge.types import Bearing, Correlation, Frame, Tdoa
+
+MEMORY_S = 0.5
+RAISE, CLEAR = 0.7, 0.2
+
+DEAD_DB = -40.0
+"""Below the loudest microphone. Beside its own rotor one hears 12 to 28 dB more than the others."""
+SILENCE = 1e-11
+"""-110 dBFS mean square in the band."""
+CLIPPED_SHARE = 0.01
+FULL_SCALE = 0.999
+OFFSET = 0.1
+SAME = 1e-3
+"""Largest difference, relative to the loudest sample, of two channels that carry one signal."""
+STRONG_PEAK = 0.5
+"""Peaks from which delays are certain enough to accuse the array of not fitting them."""
+MISFIT = 20.0
+"""Sigmas. One far source gives about 1, two sources or an echo up to some 10."""
+
+
+def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearing) -> set[str]:
+    """What is wrong in this frame alone, in words; microphones counted from 0 as in the settings."""
+    samples = frame.samples
+    mics = range(len(samples))
+    broken = {m for m in mics if correlation.bad_mics >> m & 1}
+    found = {f"microphone {m}: samples that are not numbers" for m in broken}
+    power = correlation.power
+    loudest = float(power.max())
+    if loudest <= SILENCE:
+        return found | {"no microphone hears anything"} if not broken else found
+    quiet = max(loudest * 10 ** (DEAD_DB / 10), SILENCE)
+    dead = {m for m in mics if power[m] < quiet} - broken
+    found |= {f"microphone {m}: dead, hears nothing" for m in dead}
+    magnitude = np.abs(samples)
+    clipped = np.mean(magnitude >= FULL_SCALE, axis=1)
+    offset = np.abs(samples.mean(axis=1))
+    for m in mics:
+        if m in broken:
+            continue
+        if clipped[m] > CLIPPED_SHARE:
+            found.add(f"microphone {m}: clipped, the gain is too high")
+        if offset[m] > OFFSET:
+            found.add(f"microphone {m}: a constant offset of {offset[m]:.1f} of full scale")
+    live = [m for m in mics if m not in dead | broken]
+    for k, i in enumerate(live):
+        for j in live[k + 1 :]:
+            if np.abs(samples[i] - samples[j]).max() <= SAME * magnitude[i].max():
+                found.add(f"microphones {i} and {j}: the same signal twice, check audio.channel_map")
+    if not dead and not broken and tdoa.peak.min() > STRONG_PEAK and bearing.misfit > MISFIT:
+        found.add("the delays fit no direction: channels swapped, or array.positions_m is wrong")
+    return found
+
+
+class FaultFinder:
+    """Turns symptoms of single frames into lasting faults. One per stream."""
+
+    def __init__(self) -> None:
+        self._share: dict[str, float] = {}
+        self._raised: set[str] = set()
+
+    def __call__(
+        self, frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearing, elapsed_s: float
+    ) -> tuple[str, ...]:
+        """`elapsed_s`: since the previous frame."""
+        now = symptoms(frame, correlation, tdoa, bearing)
+        keep = math.exp(-elapsed_s / MEMORY_S)
+        for text in now | self._share.keys():
+            share = keep * self._share.get(text, 0.0) + (1.0 - keep) * (text in now)
+            self._share[text] = share
+            if share > RAISE:
+                self._raised.add(text)
+            elif share < CLEAR:
+                self._raised.discard(text)
+                if share < 1e-3:
+                    del self._share[text]
+        return tuple(sorted(self._raised))
