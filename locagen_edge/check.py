@@ -93,8 +93,9 @@ async def _link(settings: Settings, seconds: float) -> Finding:
     )
     task = asyncio.create_task(link.run())
     try:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end and component.autopilot_heard_s is None:
+        for _ in range(round(seconds / 0.05)):
+            if component.autopilot_heard_s is not None:
+                break
             await asyncio.sleep(0.05)
     finally:
         task.cancel()

@@ -302,16 +302,15 @@ def _row(line: dict[str, Any]) -> str:
 # --- devices ------------------------------------------------------------------------------------------
 
 
-def _devices(arguments: argparse.Namespace) -> int:
+def _devices(_: argparse.Namespace) -> int:
     from locagen_edge.stages.mic import devices
 
     found = devices()
     if not found:
         print("no capture device: plug one in, and see `arecord -l` for what the kernel knows")
     for device in found:
-        print(
-            f"{device.name!r}: {device.channels} channels, default {device.default_rate_hz:g} Hz ({device.host_api})"
-        )
+        rate = f"default {device.default_rate_hz:g} Hz"
+        print(f"{device.name!r}: {device.channels} channels, {rate} ({device.host_api})")
     return 0
 
 

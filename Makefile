@@ -1,0 +1,111 @@
+# Two commands on a fresh machine: `make run` and `make test`. `make help` lists the rest.
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+CFLAGS_C := -std=gnu11 -Wall -Wextra -Werror -fno-math-errno -fno-trapping-math -fassociative-math -fno-signed-zeros
+KERNEL := $(wildcard csrc/*.c csrc/*.h) csrc/build_kernel.py setup.py pyproject.toml
+SYSTEMD_DIR := /lib/systemd/system
+SYSUSERS_DIR := /usr/lib/sysusers.d
+LIB_DIR := /opt/locagen-edge
+ETC_DIR := /etc/locagen-edge
+
+# $(call need,PACKAGES,WHY): installs Debian packages that are missing, where it may; else says what to do.
+define need
+	@missing=; for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || missing="$$missing $$p"; done; \
+	if [ -n "$$missing" ]; then \
+	    if [ "$$(id -u)" = 0 ]; then sudo=; else sudo="sudo -n"; fi; \
+	    echo "installing Debian packages:$$missing ($(2))"; \
+	    { $$sudo apt-get install -y -q $$missing || { $$sudo apt-get update -q && $$sudo apt-get install -y -q $$missing; }; } \
+	        >/dev/null 2>&1 || echo "could not install$$missing, needed for $(2): sudo apt install$$missing"; \
+	fi
+endef
+
+.PHONY: help
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+
+# --- for users
+
+.PHONY: run
+run: $(VENV)/.flight ## the daemon on a synthetic drone scene; SECONDS=10 ends it by itself
+	@exec $(BIN)/locagen-edge run --settings systemd/locagen-edge.toml $(if $(SECONDS),--seconds $(SECONDS))
+
+$(VENV)/.flight: $(KERNEL)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "$(PYTHON) is too old: 3.11 or later is needed"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { $(MAKE) -s .python-venv; $(PYTHON) -c 'import ensurepip'; }
+	@$(PYTHON) -c 'import os, sysconfig; raise SystemExit(not os.path.exists(sysconfig.get_path("include") + "/Python.h"))' || $(MAKE) -s .python-dev
+	$(call need,libportaudio2,capture from microphones)
+	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	@echo "setting up $(VENV) (once)"
+	@$(BIN)/pip install -q -e .
+	@touch $@
+
+.PHONY: .python-venv .python-dev
+.python-venv:
+	$(call need,python3-venv,the virtual environment)
+.python-dev:
+	$(call need,python3-dev,compiling the kernel)
+
+# --- for developers
+
+.PHONY: test
+test: $(VENV)/.dev csrc-test ## sets up and runs all tests
+	$(call need,libasound2-dev,tests with a virtual sound card)
+	$(BIN)/python -m pytest
+
+.PHONY: check
+check: $(VENV)/.dev ## lint, format, types: what CI runs before the tests
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+.PHONY: format
+format: $(VENV)/.dev ## rewrites the sources in the one format, the sample settings from their one source
+	$(BIN)/ruff check --fix -q . ; $(BIN)/ruff format .
+	$(BIN)/python -m locagen_edge.settings > systemd/locagen-edge.toml.tmp && mv systemd/locagen-edge.toml.tmp systemd/locagen-edge.toml
+
+$(VENV)/.dev: $(VENV)/.flight
+	@echo "setting up $(VENV) for development (once)"
+	@$(BIN)/pip install -q -e '.[dev,lab,bench]'
+	@touch $@
+
+.PHONY: csrc-test
+csrc-test: build/test_kernel ## the kernel's laws in C, under ASan and UBSan
+	./build/test_kernel
+
+build/test_kernel: csrc/test_kernel.c csrc/fft.c csrc/gcc_phat.c $(wildcard csrc/*.h)
+	@mkdir -p build
+	$(CC) $(CFLAGS_C) -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -Icsrc -o $@ csrc/test_kernel.c csrc/fft.c csrc/gcc_phat.c -lm
+
+.PHONY: bench
+bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
+	$(call need,libfftw3-dev,comparing with FFTW)
+	$(BIN)/python bench/bench_kernel.py
+
+.PHONY: models
+models: $(VENV)/.dev ## trains the models anew
+	$(BIN)/python -m locagen_edge.lab.train
+
+# --- the service
+
+.PHONY: install
+install: ## as root: program, unit, user and sample settings; DESTDIR is honoured
+	install -d $(DESTDIR)$(LIB_DIR) $(DESTDIR)$(ETC_DIR) $(DESTDIR)$(SYSTEMD_DIR) $(DESTDIR)$(SYSUSERS_DIR)
+	$(PYTHON) -m venv $(DESTDIR)$(LIB_DIR)
+	$(DESTDIR)$(LIB_DIR)/bin/pip install -q .
+	install -m 644 systemd/locagen-edge.service $(DESTDIR)$(SYSTEMD_DIR)/
+	install -m 644 systemd/locagen-edge.sysusers $(DESTDIR)$(SYSUSERS_DIR)/locagen-edge.conf
+	test -e $(DESTDIR)$(ETC_DIR)/locagen-edge.toml || install -m 644 systemd/locagen-edge.toml $(DESTDIR)$(ETC_DIR)/
+	@test -n "$(DESTDIR)" || { systemd-sysusers; systemctl daemon-reload; echo "now: edit $(ETC_DIR)/locagen-edge.toml, then systemctl enable --now locagen-edge"; }
+
+.PHONY: uninstall
+uninstall: ## removes all that install brought; the settings stay
+	@test -n "$(DESTDIR)" || systemctl disable --now locagen-edge 2>/dev/null || true
+	rm -rf $(DESTDIR)$(LIB_DIR)
+	rm -f $(DESTDIR)$(SYSTEMD_DIR)/locagen-edge.service $(DESTDIR)$(SYSUSERS_DIR)/locagen-edge.conf
+	@test -n "$(DESTDIR)" || systemctl daemon-reload
+
+.PHONY: clean
+clean: ## removes what was built, the virtual environment too
+	rm -rf build dist *.egg-info $(VENV) locagen_edge/*.so

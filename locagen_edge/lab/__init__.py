@@ -1,0 +1,1 @@
+"""The workshop: trains and exports what flies. Needs the `lab` extra; nothing that flies imports it."""
