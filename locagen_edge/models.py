@@ -29,7 +29,7 @@ Model = Callable[[F32], list[F32]]
 def default_directory() -> Path:
     """Where the models that came with the program lie: beside the checkout, or below the prefix."""
     beside = Path(__file__).resolve().parent.parent / "models"
-    return beside if beside.is_dir() else Path(sys.prefix) / "share" / "locagen-edge" / "models"
+    return beside if (beside / MANIFEST).is_file() else Path(sys.prefix) / "share" / "locagen-edge" / "models"
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

@@ -419,11 +419,13 @@ def _faults_of_array(s: Settings) -> Iterator[str]:
         )
 
 
+S = typing.TypeVar("S", bound=Settings)
+
 # --- reading ------------------------------------------------------------------------------------------
 
 
-def load(path: Path | str) -> Settings:
-    """Settings from a TOML file.
+def load(path: Path | str, kind: type[S] = Settings) -> S:  # type: ignore[assignment]
+    """Settings from a TOML file; `kind` may be a subclass that has more sections.
 
     Raises `SettingsError` with one line per fault, each beginning with `section.key`.
     """
@@ -435,15 +437,15 @@ def load(path: Path | str) -> Settings:
         table = tomllib.loads(text.decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path}: is not TOML: {error}") from error
-    return from_table(table)
+    return from_table(table, kind)
 
 
-def from_table(table: dict[str, Any]) -> Settings:
+def from_table(table: dict[str, Any], kind: type[S] = Settings) -> S:  # type: ignore[assignment]
     """Settings from nested dictionaries as TOML gives them. Raises `SettingsError` like `load`."""
     faults: list[str] = []
     sections: dict[str, Any] = {}
-    known = {section.name: section for section in dataclasses.fields(Settings)}
-    kinds = typing.get_type_hints(Settings)
+    known = {section.name: section for section in dataclasses.fields(kind)}
+    kinds = typing.get_type_hints(kind)
     for name, content in table.items():
         if name not in known:
             faults.append(f"{name}: unknown section; known are {', '.join(known)}")
@@ -452,7 +454,7 @@ def from_table(table: dict[str, Any]) -> Settings:
         else:
             sections[name] = _section(kinds[name], name, content, faults)
     try:
-        settings = Settings(**sections)
+        settings = kind(**sections)
     except SettingsError as error:
         faults += str(error).splitlines()
     if faults:
@@ -500,13 +502,13 @@ def _in_words(kind: Any) -> str:
 # --- the sample file ----------------------------------------------------------------------------------
 
 
-def sample() -> str:
-    """The sample file: every section and key with its sentence, unit, range and default."""
+def sample(settings: Settings | None = None) -> str:
+    """The sample file: every section and key with its sentence, unit, range and value (or default)."""
     lines = [
         "# Settings of locagen-edge. Every key may be left out; what stands here are the defaults.",
         "# Check a changed file with: locagen-edge check --settings FILE",
     ]
-    for name, section in _sections(Settings()):
+    for name, section in _sections(settings or Settings()):
         lines += ["", f"# {(type(section).__doc__ or '').strip()}", f"[{name}]"]
         for key in dataclasses.fields(section):
             lines += _wrapped(key.metadata["text"] + _limits(key.metadata))
