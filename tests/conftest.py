@@ -1,0 +1,22 @@
+"""What all tests share. onnxruntime's telemetry is off before anything can import it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+
+ROOT = Path(__file__).resolve().parent.parent
+
+RECORDINGS = Path(os.environ.get("LOCAGEN_RECORDINGS", ROOT.parent / "shared" / "data" / "audio"))
+"""Recorded speech and rotor noise, not part of the project: tests that need it skip where it is absent."""
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    if not (RECORDINGS / "MANIFEST.csv").is_file():
+        pytest.skip(f"no recordings at {RECORDINGS}: set LOCAGEN_RECORDINGS to a folder with MANIFEST.csv")
+    return RECORDINGS

@@ -1,0 +1,153 @@
+"""Settings: what is refused, and that the sample file is the truth."""
+
+from __future__ import annotations
+
+import tomllib
+
+import pytest
+from conftest import ROOT
+from hypothesis import given
+from hypothesis import strategies as st
+
+from locagen_edge.errors import SettingsError
+from locagen_edge.settings import Settings, from_table, load, sample
+
+
+def faults(table: dict) -> list[str]:
+    with pytest.raises(SettingsError) as caught:
+        from_table(table)
+    return str(caught.value).splitlines()
+
+
+def test_the_sample_file_is_the_defaults_and_up_to_date():
+    path = ROOT / "systemd" / "locagen-edge.toml"
+    assert path.read_text() == sample()
+    assert load(path) == Settings()
+
+
+def test_every_key_of_the_sample_is_explained():
+    lines = sample().splitlines()
+    for number, line in enumerate(lines):
+        if " = " in line and not line.startswith(("#", " ")):
+            assert lines[number - 1].startswith("# "), line
+
+
+def test_the_sample_of_changed_settings_reads_back_as_those():
+    changed = from_table({"audio": {"hop": 256, "loop": True}, "array": {"tolerance_m": 0}})
+    assert from_table(tomllib.loads(sample(changed))) == changed
+
+
+TRIANGLE = [[0.05, 0, 0], [-0.03, 0.05, 0], [-0.03, -0.05, 0]]
+BAD = {
+    "unknown section": ({"arrya": {}}, "arrya: unknown section"),
+    "unknown key": ({"audio": {"hopp": 1}}, "audio.hopp: unknown key"),
+    "section as value": ({"audio": 3}, "audio: is a section"),
+    "text for number": ({"audio": {"hop": "512"}}, "audio.hop: '512' is not a whole number"),
+    "float for int": ({"audio": {"hop": 512.0}}, "audio.hop: 512.0 is not a whole number"),
+    "bool for int": ({"audio": {"hop": True}}, "audio.hop: True is not a whole number"),
+    "number for list": ({"audio": {"channel_map": 1}}, "audio.channel_map: 1 is not a list"),
+    "out of range": ({"audio": {"rate_hz": 100}}, "audio.rate_hz: 100 Hz is outside 4000 to 96000 Hz"),
+    "not a number": ({"environment": {"temperature_c": float("nan")}}, "environment.temperature_c: nan"),
+    "infinite": ({"sim": {"distance_m": float("inf")}}, "sim.distance_m: inf"),
+    "choice": ({"audio": {"source": "mic"}}, "audio.source: 'mic' is none of alsa, wav, sim"),
+    "estimator": ({"bearing": {"estimator": "best"}}, "bearing.estimator: 'best'"),
+    "link": ({"mavlink": {"link": "udp:14550"}}, "mavlink.link: 'udp:14550'"),
+    "frame": ({"audio": {"frame": 1000}}, "audio.frame: 1000 is not a power of two"),
+    "hop over frame": ({"audio": {"hop": 2048}}, "audio.hop: 2048 is longer than audio.frame"),
+    "channel twice": ({"audio": {"channel_map": [0, 1, 1]}}, "audio.channel_map: [0, 1, 1] names a channel"),
+    "channel count": ({"audio": {"channel_map": [0, 1]}}, "audio.channel_map: 2 channels, but array"),
+    "channel beyond device": (
+        {"audio": {"source": "alsa", "channel_map": [0, 1, 3]}},
+        "audio.channel_map: names channel 3, but audio.device_channels is 3",
+    ),
+    "wav without file": ({"audio": {"source": "wav"}}, "audio.file: is empty"),
+    "band upside down": ({"correlation": {"band_hz": [4000, 300]}}, "correlation.band_hz: [4000.0, 300.0]"),
+    "band of three": ({"correlation": {"band_hz": [300, 400, 500]}}, "correlation.band_hz:"),
+    "band over Nyquist": ({"correlation": {"band_hz": [300, 6000]}}, "correlation.band_hz: 6000 Hz"),
+    "band too narrow": (
+        {"correlation": {"band_hz": [300, 320]}},
+        "correlation.band_hz: [300.0, 320.0]",
+    ),
+    "two coordinates": ({"array": {"positions_m": [[0, 0], [0, 1], [1, 0]]}}, "array.positions_m: every row"),
+    "one microphone": (
+        {"array": {"positions_m": [[0, 0, 0]]}, "audio": {"channel_map": [0]}},
+        "array.positions_m: 1 microphones; 2 to 8",
+    ),
+    "same place": (
+        {"array": {"positions_m": [TRIANGLE[0], TRIANGLE[1], TRIANGLE[1]]}},
+        "array.positions_m: microphones 1 and 2 are at the same place",
+    ),
+    "on a line": (
+        {"array": {"positions_m": [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]}},
+        "array.positions_m: seen from above the microphones are on one line",
+    ),
+    "upright plane": (
+        {"array": {"positions_m": [[0, 0, 0], [0.1, 0, 0], [0, 0, 0.1]]}},
+        "array.positions_m: seen from above the microphones are on one line",
+    ),
+    "array too large": (
+        {"array": {"positions_m": [[0, 0, 0], [10, 0, 0], [0, 10, 0]]}},
+        "array.positions_m: a longest delay of",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_settings_are_refused_by_name(name):
+    table, beginning = BAD[name]
+    assert any(line.startswith(beginning) for line in faults(table)), faults(table)
+
+
+def test_all_faults_are_told_at_once():
+    found = faults({"audio": {"hop": "a", "frame": 1000}, "zzz": {}, "sim": {"rotors": 99}})
+    assert {line.split(":")[0] for line in found} == {"audio.hop", "audio.frame", "zzz", "sim.rotors"}
+
+
+def test_two_microphones_on_a_line_are_fine_for_the_two_microphone_estimator():
+    settings = from_table(
+        {
+            "array": {"positions_m": [[0, -0.05, 0], [0, 0.05, 0]]},
+            "audio": {"channel_map": [0, 1]},
+            "bearing": {"estimator": "two-mic"},
+        }
+    )
+    assert settings.mic_array.mics == 2
+
+
+JSONISH = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+KEYS = [
+    (section, key) for section, keys in tomllib.loads(sample()).items() for key in keys
+]  # every key of the sample
+
+
+@given(st.dictionaries(st.sampled_from(KEYS), JSONISH, max_size=4))
+def test_any_value_is_taken_or_refused_in_words(values):
+    table: dict = {}
+    for (section, key), value in values.items():
+        table.setdefault(section, {})[key] = value
+    try:
+        settings = from_table(table)
+    except SettingsError as refused:
+        lines = str(refused).splitlines()
+    else:
+        lines = []
+        assert isinstance(settings, Settings)
+    assert all(": " in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(b"[audio\n", "is not TOML"), (b"\xff\xfe", "is not TOML"), (None, "cannot be read")],
+)
+def test_unreadable_files_are_told_in_one_line(tmp_path, content, says):
+    path = tmp_path / "s.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SettingsError, match=says) as caught:
+        load(path)
+    assert len(str(caught.value).splitlines()) == 1
+    assert str(path) in str(caught.value)
