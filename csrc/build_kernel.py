@@ -24,7 +24,8 @@ CFLAGS = [
     "-Wall",
     "-Wextra",
 ]
-SOURCES = ["fft.c", "gcc_phat.c"]
+SOURCES = ["gcc_phat.c", "fft.c", "frame_quad.c", "frame_avx2.c"]
+HEADERS = ["locagen.h", "gcc_phat.h", "fft.h", "lanes.h", "fft_passes.h", "frame_path.h"]
 
 header = (HERE / "locagen.h").read_text(encoding="utf-8")
 match = re.search(r"/\* \[python\].*?\*/(.*?)/\* \[/python\] \*/", header, re.DOTALL)
@@ -38,7 +39,7 @@ ffi.set_source(
     '#include "locagen.h"',
     sources=[str((HERE / name).relative_to(ROOT)) for name in SOURCES],
     include_dirs=[str(HERE.relative_to(ROOT))],
-    depends=[str((HERE / name).relative_to(ROOT)) for name in ("locagen.h", "fft.h")],
+    depends=[str((HERE / name).relative_to(ROOT)) for name in HEADERS],
     extra_compile_args=CFLAGS,
     libraries=["m"],
 )

@@ -1,0 +1,242 @@
+/* frame_path.h - the way of one frame: samples, bins, unit bins, products, coarse bins, lags.
+ *
+ * Included once for each vector width by a file that defines WIDTH. Lanes are microphones up to the
+ * products and pairs behind them; in the last step, where a few pairs meet many lags, lanes are lags.
+ */
+#include "fft_passes.h"
+#include "gcc_phat.h"
+
+#include <float.h>
+
+/* Sum over the band of each lane's squared magnitudes. */
+INLINE quad band_power(const state *s, spectrum bins)
+{
+    vec even = {0}, odd = {0};
+    for (long at = 4 * (s->first_bin & ~1L); at <= 4 * (long)s->last_bin; at += 8) {
+        for (int half = 0; half < 8; half += WIDTH) {
+            vec re = load(bins.re + at + half), im = load(bins.im + at + half);
+            even += re * re;
+            odd += im * im;
+        }
+    }
+    return folded(even + odd);
+}
+
+/* 1 / sqrt(x) for x >= 0, finite: the first guess from the exponent's bits (Lomont 2003, "Fast inverse
+ * square root"), good to 3.4 %, times the cubic in h = x guess^2 that is nearest to 1 / sqrt(h) for the h
+ * that occur (0.932 to 1.069): 7.5e-7. At zero the answer is finite. */
+INLINE vec inverse_root(vec x)
+{
+    vec guess = (vec)(0x5f3759df - ((ivec)x >> 1));
+    vec h = x * guess * guess;
+    return guess * (2.18936135f + h * (-2.19180671f + h * (1.31552748f - 0.31308287f * h)));
+}
+
+/* X -> X / sqrt(|X|^2 + floor). */
+INLINE void whiten(const state *s, quad floor, spectrum bins)
+{
+    vec floors = both(floor);
+    for (long at = 4 * (s->first_bin & ~1L); at <= 4 * (s->last_bin | 1L); at += WIDTH) {
+        vec re = load(bins.re + at), im = load(bins.im + at);
+        vec scale = inverse_root(re * re + im * im + floors);
+        store(bins.re + at, re * scale);
+        store(bins.im + at, im * scale);
+    }
+}
+
+INLINE void clear_lane(spectrum bins, long first, long last, int lane)
+{
+    for (long k = first; k <= last; k++)
+        bins.re[4 * k + lane] = bins.im[4 * k + lane] = 0.0f;
+}
+
+/* Unit bins of one group of up to four microphones; returns the mask of those that are not finite. */
+INLINE int unit_bins(const state *s, const float *in, int mics, spectrum work, spectrum bins, float *power)
+{
+    /* A lane without a microphone repeats the first one, which is in memory anyhow; nobody reads it. */
+    const float *rows[4];
+    for (int lane = 0; lane < 4; lane++)
+        rows[lane] = in + (lane < mics ? lane : 0) * (long)s->samples;
+    real_fft(&s->fft, rows, s->part_low, s->part_high, work, bins);
+
+    long first = s->first_bin & ~1L, last = s->last_bin | 1L;
+    for (int lane = 0; lane < 4; lane++) { /* neighbours outside the band that share a vector with it */
+        if (first < s->first_bin)
+            clear_lane(bins, first, first, lane);
+        if (last > s->last_bin)
+            clear_lane(bins, last, last, lane);
+    }
+    quad sum = band_power(s, bins);
+    int bad = 0;
+    for (int lane = 0; lane < mics; lane++) {
+        /* Half of the range is left for the floor. NaN fails the comparison too. */
+        if (!(sum[lane] < FLT_MAX / 2)) {
+            bad |= 1 << lane;
+            sum[lane] = 0.0f;
+            clear_lane(bins, first, last, lane);
+        }
+        power[lane] = sum[lane];
+    }
+    quad floor = sum * (s->relative_floor * s->bin_share);
+    for (int lane = 0; lane < 4; lane++)
+        floor[lane] = floor[lane] > s->floor ? floor[lane] : s->floor;
+    whiten(s, floor, bins);
+    return bad;
+}
+
+INLINE vec turned(vec v, const enum turn turn)
+{
+    switch (turn) {
+    case TURN_RING3:
+        return SHUFFLED(v, v, 1, 2, 0, 3);
+    case TURN_1:
+        return SHUFFLED(v, v, 1, 2, 3, 0);
+    case TURN_2:
+        return SHUFFLED(v, v, 2, 3, 0, 1);
+    case TURN_3:
+        return SHUFFLED(v, v, 3, 0, 1, 2);
+    default:
+        return v;
+    }
+}
+
+/* U_j conj(U_i) of up to four pairs: a delay of j turns it by exp(-i omega tau). */
+INLINE void product(spectrum i, spectrum j, long at, const enum turn turn, vec *re, vec *im)
+{
+    vec ir = load(i.re + at), ii = load(i.im + at);
+    vec jr = turned(load(j.re + at), turn), ji = turned(load(j.im + at), turn);
+    *re = jr * ir + ji * ii;
+    *im = ji * ir - jr * ii;
+}
+
+/* The product of two groups, thinned out to coarse bins. */
+INLINE void coarse_bins(const state *s, spectrum i, spectrum j, const enum turn turn, quad direction, spectrum coarse)
+{
+    long first = s->first_bin & ~1L, end = (s->last_bin | 1L) + 1;
+    if (s->decimation == 1) {
+        for (long k = first; k < end; k += QUADS) {
+            vec re, im;
+            product(i, j, 4 * k, turn, &re, &im);
+            store(coarse.re + 4 * (k - first), re);
+            store(coarse.im + 4 * (k - first), im * both(direction));
+        }
+        return;
+    }
+    long decimation = s->decimation;
+    memset(coarse.re, 0, sizeof(quad) * (size_t)s->coarse);
+    memset(coarse.im, 0, sizeof(quad) * (size_t)s->coarse);
+    float *to_re = coarse.re, *to_im = coarse.im;
+    for (long block = first & -decimation; block < end; block += decimation, to_re += 4, to_im += 4) {
+        long from = block > first ? block : first, till = block + decimation < end ? block + decimation : end;
+        vec sum_re[TAPS] = {0}, sum_im[TAPS] = {0};
+        for (long k = from; k < till; k += QUADS) {
+            const float *weight = s->weights + 4 * (k - block);
+            vec re, im;
+            product(i, j, 4 * k, turn, &re, &im);
+            for (int tap = 0; tap < TAPS; tap++, weight += 4 * decimation) {
+                sum_re[tap] += load(weight) * re;
+                sum_im[tap] += load(weight) * im;
+            }
+        }
+        for (int tap = 0; tap < TAPS; tap++) {
+            store_quad(to_re + 4 * tap, load_quad(to_re + 4 * tap) + folded(sum_re[tap]));
+            store_quad(to_im + 4 * tap, load_quad(to_im + 4 * tap) + direction * folded(sum_im[tap]));
+        }
+    }
+}
+
+INLINE void turn_coarse(const state *s, const float *phasors, spectrum coarse)
+{
+    for (long c = 0; c < s->coarse; c++) {
+        quad re = load_quad(coarse.re + 4 * c), im = load_quad(coarse.im + 4 * c);
+        store_quad(coarse.re + 4 * c, re * phasors[2 * c] - im * phasors[2 * c + 1]);
+        store_quad(coarse.im + 4 * c, re * phasors[2 * c + 1] + im * phasors[2 * c]);
+    }
+}
+
+/* One block of lags of PAIRS pairs. Lags +l and -l share the even part E = sum Re(S) cos and the odd part
+ * O = sum Im(S) sin: r(+l) = E - O, r(-l) = E + O. */
+INLINE void lags_of(const int PAIRS, const state *s, long centre, const int32_t *lane, const int32_t *row, spectrum coarse, float *out)
+{
+    enum { MIDDLE = BLOCK_HALF + 1 };
+    float both_sides[3][2 * MIDDLE];
+    for (long l = 0; l < s->table_lags; l += 2 * WIDTH) {
+        vec even[3][2] = {0}, odd[3][2] = {0};
+        const float *table = s->table + l;
+        for (long c = 0; c < s->coarse; c++, table += 2 * s->table_lags) {
+            vec cos0 = load(table), cos1 = load(table + WIDTH);
+            vec sin0 = load(table + s->table_lags), sin1 = load(table + s->table_lags + WIDTH);
+            for (int n = 0; n < PAIRS; n++) {
+                float re = coarse.re[4 * c + lane[n]], im = coarse.im[4 * c + lane[n]];
+                even[n][0] += re * cos0, even[n][1] += re * cos1;
+                odd[n][0] += im * sin0, odd[n][1] += im * sin1;
+            }
+        }
+        for (int n = 0; n < PAIRS; n++)
+            for (int v = 0; v < 2; v++) {
+                long lag = l + v * WIDTH;
+                store(&both_sides[n][MIDDLE + lag], even[n][v] - odd[n][v]);
+                store(&both_sides[n][MIDDLE - lag - (WIDTH - 1)], reversed(even[n][v] + odd[n][v]));
+            }
+    }
+    long count = 2 * (long)s->lags + 1, middle = s->lags + centre;
+    long from = middle - s->half > 0 ? middle - s->half : 0;
+    long till = middle + s->half + 1 < count ? middle + s->half + 1 : count;
+    for (int n = 0; n < PAIRS; n++) {
+        float *to = out + row[n] * count;
+        for (long l = from; l < till; l++)
+            to[l] = both_sides[n][MIDDLE + l - middle] * s->gain[l];
+    }
+}
+
+INLINE void lags(const state *s, const locagen_product *p, spectrum coarse, float *out)
+{
+    if (s->blocks > 1)
+        turn_coarse(s, s->start, coarse);
+    for (long block = 0; block < s->blocks; block++) {
+        long centre = (block - s->blocks / 2) * (2 * BLOCK_HALF + 1);
+        if (block > 0)
+            turn_coarse(s, s->step, coarse);
+        if (p->pairs == 3)
+            lags_of(3, s, centre, p->lane, p->row, coarse, out);
+        else
+            for (int n = 0; n < p->pairs; n++)
+                lags_of(1, s, centre, p->lane + n, p->row + n, coarse, out);
+    }
+}
+
+INLINE int frame_path(const state *s, const float *in, float *correlation, float *power)
+{
+    spectrum work = {s->work_re, s->work_im}, coarse = {s->coarse_re, s->coarse_im};
+    int bad = 0;
+    for (int group = 0; group < s->groups; group++) {
+        int mics = s->mics - 4 * group < 4 ? s->mics - 4 * group : 4;
+        spectrum bins = {s->bins_re[group], s->bins_im[group]};
+        bad |= unit_bins(s, in + 4 * group * (long)s->samples, mics, work, bins, power + 4 * group) << 4 * group;
+    }
+    for (int n = 0; n < s->products; n++) {
+        const locagen_product *p = &s->product[n];
+        spectrum i = {s->bins_re[p->group_i], s->bins_im[p->group_i]};
+        spectrum j = {s->bins_re[p->group_j], s->bins_im[p->group_j]};
+        quad direction = load_quad(p->direction);
+        switch (p->turn) {
+        case TURN_RING3:
+            coarse_bins(s, i, j, TURN_RING3, direction, coarse);
+            break;
+        case TURN_0:
+            coarse_bins(s, i, j, TURN_0, direction, coarse);
+            break;
+        case TURN_1:
+            coarse_bins(s, i, j, TURN_1, direction, coarse);
+            break;
+        case TURN_2:
+            coarse_bins(s, i, j, TURN_2, direction, coarse);
+            break;
+        default:
+            coarse_bins(s, i, j, TURN_3, direction, coarse);
+            break;
+        }
+        lags(s, p, coarse, correlation);
+    }
+    return bad;
+}
