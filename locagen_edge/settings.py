@@ -189,7 +189,7 @@ class CorrelationSettings:
         most=0,
     )
     relative_floor_db: float = setting(
-        -50.0,
+        -20.0,
         "The same, relative to the mean bin of the frame: bins that the sound leaves empty do not count.",
         unit="dB",
         least=-120,

@@ -6,8 +6,16 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck
+from hypothesis import settings as hypothesis_settings
 
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+
+# Time is the machine's affair, not a law; the same examples every time: a red test stays red.
+hypothesis_settings.register_profile(
+    "laws", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
+hypothesis_settings.load_profile("laws")
 
 ROOT = Path(__file__).resolve().parent.parent
 

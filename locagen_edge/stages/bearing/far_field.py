@@ -52,9 +52,12 @@ def _from_direction(
     length = float(np.linalg.norm(v))
     if length < 1e-9:
         v, length = v + 1e-9, 1e-9 * math.sqrt(len(v))
+    spare = len(delay) - len(plane)
     if len(plane) == 3 or length > 1.0:
         v = v / length  # onto the sphere, or the rim of the disc of possible directions
-    misfit = float(np.sqrt(np.mean(((delay - slope @ v) / sigma) ** 2)))
+        spare += 1
+    misfit = float(np.sqrt(np.sum(((delay - slope @ v) / sigma) ** 2) / max(spare, 1)))
+    covariance = covariance * max(misfit, 1.0) ** 2  # delays that disagree are worse than they claim
     u = plane.T @ v
     turn = plane.T  # du / dv
     if len(plane) == 2:

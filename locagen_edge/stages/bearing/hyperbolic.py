@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,8 +14,12 @@ from locagen_edge.stages.bearing.common import NOWHERE_RAD, DelayModel, Estimato
 from locagen_edge.stages.bearing.far_field import far_field
 from locagen_edge.types import F64, Bearing, Fix, Tdoa
 
-STARTS_M = (0.3, 3.0, 100.0)
-"""Ranges from which the minimiser starts; the directions are the far field's and its opposite."""
+STARTS = (1.2, 2.0, 5.0, 1000.0)
+"""Ranges, in radii of the array, from which the minimiser starts, in the direction of the far field.
+
+Two hyperbolas can cross twice: three microphones then have two exact answers, one of them within some
+five spacings. Several starts find both; of answers that fit alike the farther is given (a caller is rarely
+at arm's length), and the range counts as not observable."""
 
 FARTHEST_M = 1e4
 """Where the search ends: beyond a kilometre a curved wave differs from a plane one by nanoseconds."""
@@ -55,26 +60,24 @@ def hyperbolic(settings: Settings) -> Estimator:
         if not np.isfinite(wanted).all() or start.azimuth_rad is None:
             return no_bearing("hyperbolic")
         sigma = model.sigma_s(tdoa)[base] * speed
-        cost, q, jacobian = min(
-            (
-                _levenberg_marquardt(differences, wanted, np.array([*angle, 1.0 / range_m]))
-                for angle in _start_angles(start, solid)
-                for range_m in STARTS_M
-            ),
-            key=lambda found: found[0],
-        )
+        angle = (start.azimuth_rad, start.elevation_rad or 0.0) if solid else (start.azimuth_rad,)
+        found = [
+            _levenberg_marquardt(differences, wanted, np.array([*angle, 1.0 / (nearest * start_range)]))
+            for start_range in STARTS
+        ]
+        best = min(cost for cost, _, _ in found)
+        alike = [answer for answer in found if answer[0] <= best + float(np.mean(sigma**2))]
+        cost, q, jacobian = min(alike, key=lambda answer: float(answer[1][-1]))
+        rival = max(float(answer[1][-1]) for answer in alike)
         noise = correlation * np.outer(sigma, sigma)
         gain = np.linalg.pinv(jacobian)
-        return _from_position(q, place(q), gain @ noise @ gain.T, math.sqrt(cost), sigma, start, solid)
+        covariance = gain @ noise @ gain.T
+        bearing = _from_position(q, place(q), covariance, math.sqrt(cost), sigma, start, solid)
+        unique = rival - q[-1] <= 3.0 * math.sqrt(max(float(covariance[-1, -1]), 0.0)) + 1e-6
+        assert bearing.fix is not None
+        return bearing if unique else replace(bearing, fix=replace(bearing.fix, range_observable=False))
 
     return estimate
-
-
-def _start_angles(start: Bearing, solid: bool) -> list[tuple[float, ...]]:
-    azimuth = start.azimuth_rad or 0.0
-    if solid:
-        return [(azimuth, start.elevation_rad or 0.0)]
-    return [(azimuth,), (azimuth + math.pi,)]
 
 
 def _levenberg_marquardt(
