@@ -11,15 +11,21 @@
 /* Sum over the band of each lane's squared magnitudes. */
 INLINE quad band_power(const state *s, spectrum bins)
 {
-    vec even = {0}, odd = {0};
-    for (long at = 4 * (s->first_bin & ~1L); at <= 4 * (long)s->last_bin; at += 8) {
-        for (int half = 0; half < 8; half += WIDTH) {
-            vec re = load(bins.re + at + half), im = load(bins.im + at + half);
-            even += re * re;
-            odd += im * im;
+    /* Four sums: one alone would wait for each addition to end. */
+    vec sum[4] = {0};
+    long at = 4 * (s->first_bin & ~1L), end = 4 * ((s->last_bin | 1L) + 1);
+    for (; at + 2 * WIDTH <= end; at += 2 * WIDTH)
+        for (int n = 0; n < 2; n++) {
+            vec re = load(bins.re + at + n * WIDTH), im = load(bins.im + at + n * WIDTH);
+            sum[2 * n] += re * re;
+            sum[2 * n + 1] += im * im;
         }
+    for (; at < end; at += WIDTH) {
+        vec re = load(bins.re + at), im = load(bins.im + at);
+        sum[0] += re * re;
+        sum[1] += im * im;
     }
-    return folded(even + odd);
+    return folded((sum[0] + sum[1]) + (sum[2] + sum[3]));
 }
 
 /* 1 / sqrt(x) for x >= 0, finite: the first guess from the exponent's bits (Lomont 2003, "Fast inverse
@@ -123,12 +129,10 @@ INLINE void coarse_bins(const state *s, spectrum i, spectrum j, const enum turn 
         return;
     }
     long decimation = s->decimation;
-    memset(coarse.re, 0, sizeof(quad) * (size_t)s->coarse);
-    memset(coarse.im, 0, sizeof(quad) * (size_t)s->coarse);
+    vec sum_re[TAPS] = {0}, sum_im[TAPS] = {0};
     float *to_re = coarse.re, *to_im = coarse.im;
     for (long block = first & -decimation; block < end; block += decimation, to_re += 4, to_im += 4) {
         long from = block > first ? block : first, till = block + decimation < end ? block + decimation : end;
-        vec sum_re[TAPS] = {0}, sum_im[TAPS] = {0};
         for (long k = from; k < till; k += QUADS) {
             const float *weight = s->weights + 4 * (k - block);
             vec re, im;
@@ -138,10 +142,16 @@ INLINE void coarse_bins(const state *s, spectrum i, spectrum j, const enum turn 
                 sum_im[tap] += load(weight) * im;
             }
         }
-        for (int tap = 0; tap < TAPS; tap++) {
-            store_quad(to_re + 4 * tap, load_quad(to_re + 4 * tap) + folded(sum_re[tap]));
-            store_quad(to_im + 4 * tap, load_quad(to_im + 4 * tap) + direction * folded(sum_im[tap]));
-        }
+        /* The blocks to come no longer reach the first of the coarse bins; the others move up. */
+        store_quad(to_re, folded(sum_re[0]));
+        store_quad(to_im, folded(sum_im[0]) * direction);
+        for (int tap = 1; tap < TAPS; tap++)
+            sum_re[tap - 1] = sum_re[tap], sum_im[tap - 1] = sum_im[tap];
+        sum_re[TAPS - 1] = sum_im[TAPS - 1] = all(0.0f);
+    }
+    for (int tap = 0; tap < TAPS - 1; tap++, to_re += 4, to_im += 4) {
+        store_quad(to_re, folded(sum_re[tap]));
+        store_quad(to_im, folded(sum_im[tap]) * direction);
     }
 }
 
