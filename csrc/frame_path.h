@@ -9,7 +9,7 @@
 #include <float.h>
 
 /* Sum over the band of each lane's squared magnitudes. */
-INLINE quad band_power(const state *s, spectrum bins)
+STEP quad band_power(const state *s, spectrum bins)
 {
     /* Four sums: one alone would wait for each addition to end. */
     vec sum[4] = {0};
@@ -39,10 +39,11 @@ INLINE vec inverse_root(vec x)
 }
 
 /* X -> X / sqrt(|X|^2 + floor). */
-INLINE void whiten(const state *s, quad floor, spectrum bins)
+STEP void whiten(const state *s, quad floor, spectrum bins)
 {
     vec floors = both(floor);
-    for (long at = 4 * (s->first_bin & ~1L); at <= 4 * (s->last_bin | 1L); at += WIDTH) {
+    long end = 4 * ((s->last_bin | 1L) + 1);
+    for (long at = 4 * (s->first_bin & ~1L); at < end; at += WIDTH) {
         vec re = load(bins.re + at), im = load(bins.im + at);
         vec scale = inverse_root(re * re + im * im + floors);
         store(bins.re + at, re * scale);
@@ -155,7 +156,22 @@ INLINE void coarse_bins(const state *s, spectrum i, spectrum j, const enum turn 
     }
 }
 
-INLINE void turn_coarse(const state *s, const float *phasors, spectrum coarse)
+#define COARSE_BINS(name, turn)                                                                              \
+    STEP void name(const state *s, spectrum i, spectrum j, quad direction, spectrum coarse)                  \
+    {                                                                                                        \
+        coarse_bins(s, i, j, turn, direction, coarse);                                                       \
+    }
+COARSE_BINS(coarse_bins_ring3, TURN_RING3)
+COARSE_BINS(coarse_bins_0, TURN_0)
+COARSE_BINS(coarse_bins_1, TURN_1)
+COARSE_BINS(coarse_bins_2, TURN_2)
+COARSE_BINS(coarse_bins_3, TURN_3)
+static void (*const COARSE_BINS_OF[TURNS])(const state *, spectrum, spectrum, quad, spectrum) = {
+    [TURN_RING3] = coarse_bins_ring3, [TURN_0] = coarse_bins_0, [TURN_1] = coarse_bins_1,
+    [TURN_2] = coarse_bins_2,         [TURN_3] = coarse_bins_3,
+};
+
+STEP void turn_coarse(const state *s, const float *phasors, spectrum coarse)
 {
     for (long c = 0; c < s->coarse; c++) {
         quad re = load_quad(coarse.re + 4 * c), im = load_quad(coarse.im + 4 * c);
@@ -199,6 +215,15 @@ INLINE void lags_of(const int PAIRS, const state *s, long centre, const int32_t 
     }
 }
 
+#define LAGS_OF(name, PAIRS)                                                                                 \
+    STEP void name(const state *s, long centre, const int32_t *lane, const int32_t *row, spectrum coarse,    \
+                   float *out)                                                                               \
+    {                                                                                                        \
+        lags_of(PAIRS, s, centre, lane, row, coarse, out);                                                   \
+    }
+LAGS_OF(lags_of_3, 3)
+LAGS_OF(lags_of_1, 1)
+
 INLINE void lags(const state *s, const locagen_product *p, spectrum coarse, float *out)
 {
     if (s->blocks > 1)
@@ -208,10 +233,10 @@ INLINE void lags(const state *s, const locagen_product *p, spectrum coarse, floa
         if (block > 0)
             turn_coarse(s, s->step, coarse);
         if (p->pairs == 3)
-            lags_of(3, s, centre, p->lane, p->row, coarse, out);
+            lags_of_3(s, centre, p->lane, p->row, coarse, out);
         else
             for (int n = 0; n < p->pairs; n++)
-                lags_of(1, s, centre, p->lane + n, p->row + n, coarse, out);
+                lags_of_1(s, centre, p->lane + n, p->row + n, coarse, out);
     }
 }
 
@@ -229,23 +254,7 @@ INLINE int frame_path(const state *s, const float *in, float *correlation, float
         spectrum i = {s->bins_re[p->group_i], s->bins_im[p->group_i]};
         spectrum j = {s->bins_re[p->group_j], s->bins_im[p->group_j]};
         quad direction = load_quad(p->direction);
-        switch (p->turn) {
-        case TURN_RING3:
-            coarse_bins(s, i, j, TURN_RING3, direction, coarse);
-            break;
-        case TURN_0:
-            coarse_bins(s, i, j, TURN_0, direction, coarse);
-            break;
-        case TURN_1:
-            coarse_bins(s, i, j, TURN_1, direction, coarse);
-            break;
-        case TURN_2:
-            coarse_bins(s, i, j, TURN_2, direction, coarse);
-            break;
-        default:
-            coarse_bins(s, i, j, TURN_3, direction, coarse);
-            break;
-        }
+        COARSE_BINS_OF[p->turn](s, i, j, direction, coarse);
         lags(s, p, coarse, correlation);
     }
     return bad;
