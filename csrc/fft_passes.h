@@ -24,26 +24,30 @@ INLINE void dft4(vec re[4], vec im[4])
     re[3] = dr - ei, im[3] = di + er;
 }
 
-INLINE void dft8(vec re[8], vec im[8])
+/* The even outputs of radix 8, 0 2 4 6, in a[0..3]. Odd and even ones are made one after the other, each from the
+ * eight inputs: sixteen registers hold one half, not both. */
+INLINE void dft8_even(const vec re[8], const vec im[8], vec ar[4], vec ai[4])
+{
+    for (int j = 0; j < 4; j++)
+        ar[j] = re[j] + re[j + 4], ai[j] = im[j] + im[j + 4];
+    dft4(ar, ai);
+}
+
+/* The odd outputs, 1 3 5 7: the differences turn by 0, 1/8, 2/8, 3/8; the root of one half is left to the last
+ * additions, where it joins a fused multiply-add. */
+INLINE void dft8_odd(const vec re[8], const vec im[8], vec ar[4], vec ai[4])
 {
     const float half_root = 0.70710678118654752f;
-    vec ar[4], ai[4], dr[4], di[4];
-    for (int j = 0; j < 4; j++) {
-        ar[j] = re[j] + re[j + 4], ai[j] = im[j] + im[j + 4];
+    vec dr[4], di[4];
+    for (int j = 0; j < 4; j++)
         dr[j] = re[j] - re[j + 4], di[j] = im[j] - im[j + 4];
-    }
-    dft4(ar, ai);
-    /* The differences turn by 0, 1/8, 2/8, 3/8; the root of one half is left to the last additions,
-     * where it joins a fused multiply-add. */
     vec ur = dr[1] + di[1], ui = di[1] - dr[1], vr = di[3] - dr[3], vi = dr[3] + di[3];
     vec pr = dr[0] + di[2], pi = di[0] - dr[2], qr = dr[0] - di[2], qi = di[0] + dr[2];
     vec sr = ur + vr, si = ui - vi, tr = ui + vi, ti = vr - ur;
-    for (int j = 0; j < 4; j++)
-        re[2 * j] = ar[j], im[2 * j] = ai[j];
-    re[1] = pr + half_root * sr, im[1] = pi + half_root * si;
-    re[5] = pr - half_root * sr, im[5] = pi - half_root * si;
-    re[3] = qr + half_root * tr, im[3] = qi + half_root * ti;
-    re[7] = qr - half_root * tr, im[7] = qi - half_root * ti;
+    ar[0] = pr + half_root * sr, ai[0] = pi + half_root * si;
+    ar[1] = qr + half_root * tr, ai[1] = qi + half_root * ti;
+    ar[2] = pr - half_root * sr, ai[2] = pi - half_root * si;
+    ar[3] = qr - half_root * tr, ai[3] = qi - half_root * ti;
 }
 
 INLINE void times(vec *re, vec *im, vec wr, vec wi)
@@ -68,7 +72,7 @@ INLINE void fetch(const float *const rows[4], const float *window, long s, vec r
     im[1] = SHUFFLED(ab, cd, 2, 3, 6, 7);
 }
 
-INLINE void first_pass(const locagen_fft *fft, const float *const rows[4], spectrum to)
+STEP void first_pass(const locagen_fft *fft, const float *const rows[4], spectrum to)
 {
     long eighth = fft->points / 8;
     for (long p = 0; p < eighth; p += WIDTH / 2) {
@@ -82,12 +86,19 @@ INLINE void first_pass(const locagen_fft *fft, const float *const rows[4], spect
         for (int e = 0; e < 2; e++) {
             long place = (p & ~3L) + 2 * e + ((p >> 1) & 1);
             const float *w = fft->first + (place >> 1) * 7 * 16 + (place & 1) * 4;
-            dft8(re[e], im[e]);
-            for (int j = 1; j < 8; j++)
-                times(&re[e][j], &im[e][j], load(w + 16 * (j - 1)), load(w + 16 * (j - 1) + 8));
-            for (int j = 0; j < 8; j++) {
-                store_apart(to.re + 4 * (8 * (p + e) + j), 4 * 8 * 2, re[e][j]);
-                store_apart(to.im + 4 * (8 * (p + e) + j), 4 * 8 * 2, im[e][j]);
+            for (int odd = 0; odd < 2; odd++) {
+                vec ar[4], ai[4];
+                if (odd)
+                    dft8_odd(re[e], im[e], ar, ai);
+                else
+                    dft8_even(re[e], im[e], ar, ai);
+                for (int n = 0; n < 4; n++) {
+                    int j = 2 * n + odd;
+                    if (j > 0)
+                        times(&ar[n], &ai[n], load(w + 16 * (j - 1)), load(w + 16 * (j - 1) + 8));
+                    store_apart(to.re + 4 * (8 * (p + e) + j), 4 * 8 * 2, ar[n]);
+                    store_apart(to.im + 4 * (8 * (p + e) + j), 4 * 8 * 2, ai[n]);
+                }
             }
         }
     }
@@ -99,20 +110,27 @@ INLINE void pass(const int R, const int last, long length, long stride, const fl
     long part = length / R;
     for (long p = 0; p < part; p++, twiddles += 2 * (R - 1))
         for (long q = 0; q < stride; q += QUADS) {
-            vec re[8], im[8];
-            for (int j = 0; j < R; j++) {
-                long at = 4 * (q + stride * (p + part * j));
-                re[j] = load(from.re + at), im[j] = load(from.im + at);
-            }
-            if (R == 8)
-                dft8(re, im);
-            else
-                dft4(re, im);
-            for (int j = 0; j < R; j++) {
-                long at = 4 * (q + stride * (R * p + j));
-                if (j > 0 && !last)
-                    times(&re[j], &im[j], all(twiddles[2 * j - 2]), all(twiddles[2 * j - 1]));
-                store(to.re + at, re[j]), store(to.im + at, im[j]);
+            for (int odd = 0; odd < R / 4; odd++) {
+                vec re[8], im[8];
+                for (int j = 0; j < R; j++) {
+                    long at = 4 * (q + stride * (p + part * j));
+                    re[j] = load(from.re + at), im[j] = load(from.im + at);
+                }
+                vec ar[4], ai[4];
+                if (R == 4) {
+                    memcpy(ar, re, sizeof ar), memcpy(ai, im, sizeof ai);
+                    dft4(ar, ai);
+                } else if (odd)
+                    dft8_odd(re, im, ar, ai);
+                else
+                    dft8_even(re, im, ar, ai);
+                for (int n = 0; n < 4; n++) {
+                    int j = R / 4 * n + odd;
+                    long at = 4 * (q + stride * (R * p + j));
+                    if (j > 0 && !last)
+                        times(&ar[n], &ai[n], all(twiddles[2 * j - 2]), all(twiddles[2 * j - 1]));
+                    store(to.re + at, ar[n]), store(to.im + at, ai[n]);
+                }
             }
         }
 }
@@ -120,7 +138,7 @@ INLINE void pass(const int R, const int last, long length, long stride, const fl
 /* Parts the complex transform into the bins low..high of the real signals, and their mirror images
  * points - low..points - high: X(k) = E - t, X(points - k) = conj(E + t), with E = Z(k) + conj Z(points - k),
  * t = i w^k (Z(k) - conj Z(points - k)); the missing half is the window's. low is even. */
-INLINE void part(const locagen_fft *fft, long low, long high, spectrum from, spectrum to)
+STEP void part(const locagen_fft *fft, long low, long high, spectrum from, spectrum to)
 {
     for (long k = low; k <= high; k += QUADS) {
         long up = 4 * k, down = 4 * (fft->points - k);
@@ -134,6 +152,16 @@ INLINE void part(const locagen_fft *fft, long low, long high, spectrum from, spe
     }
 }
 
+#define PASS(name, R, last)                                                                                  \
+    STEP void name(long length, long stride, const float *twiddles, spectrum from, spectrum to)              \
+    {                                                                                                        \
+        pass(R, last, length, stride, twiddles, from, to);                                                   \
+    }
+PASS(middle8, 8, 0)
+PASS(middle4, 4, 0)
+PASS(last8, 8, 1)
+PASS(last4, 4, 1)
+
 /* From rows of samples to bins low..high and their mirror images, in `to`; `work` is lost. Both hold
  * points + 2 quads. */
 INLINE void real_fft(const locagen_fft *fft, const float *const rows[4], long low, long high, spectrum work, spectrum to)
@@ -143,15 +171,10 @@ INLINE void real_fft(const locagen_fft *fft, const float *const rows[4], long lo
     long length = fft->points / 8, stride = 8;
     for (int n = 1; n < fft->passes; n++) {
         int radix = fft->radix[n];
-        if (n == fft->passes - 1) {
-            if (radix == 8)
-                pass(8, 1, length, stride, NULL, a, b);
-            else
-                pass(4, 1, length, stride, NULL, a, b);
-        } else if (radix == 8)
-            pass(8, 0, length, stride, fft->middle[n], a, b);
+        if (n == fft->passes - 1)
+            (radix == 8 ? last8 : last4)(length, stride, NULL, a, b);
         else
-            pass(4, 0, length, stride, fft->middle[n], a, b);
+            (radix == 8 ? middle8 : middle4)(length, stride, fft->middle[n], a, b);
         length /= radix, stride *= radix;
         spectrum swap = a;
         a = b, b = swap;

@@ -9,17 +9,23 @@
 #include <float.h>
 
 /* Sum over the band of each lane's squared magnitudes. */
-INLINE quad band_power(const state *s, spectrum bins)
+STEP quad band_power(const state *s, spectrum bins)
 {
-    vec even = {0}, odd = {0};
-    for (long at = 4 * (s->first_bin & ~1L); at <= 4 * (long)s->last_bin; at += 8) {
-        for (int half = 0; half < 8; half += WIDTH) {
-            vec re = load(bins.re + at + half), im = load(bins.im + at + half);
-            even += re * re;
-            odd += im * im;
+    /* Four sums: one alone would wait for each addition to end. */
+    vec sum[4] = {0};
+    long at = 4 * (s->first_bin & ~1L), end = 4 * ((s->last_bin | 1L) + 1);
+    for (; at + 2 * WIDTH <= end; at += 2 * WIDTH)
+        for (int n = 0; n < 2; n++) {
+            vec re = load(bins.re + at + n * WIDTH), im = load(bins.im + at + n * WIDTH);
+            sum[2 * n] += re * re;
+            sum[2 * n + 1] += im * im;
         }
+    for (; at < end; at += WIDTH) {
+        vec re = load(bins.re + at), im = load(bins.im + at);
+        sum[0] += re * re;
+        sum[1] += im * im;
     }
-    return folded(even + odd);
+    return folded((sum[0] + sum[1]) + (sum[2] + sum[3]));
 }
 
 /* 1 / sqrt(x) for x >= 0, finite: the first guess from the exponent's bits (Lomont 2003, "Fast inverse
@@ -33,10 +39,11 @@ INLINE vec inverse_root(vec x)
 }
 
 /* X -> X / sqrt(|X|^2 + floor). */
-INLINE void whiten(const state *s, quad floor, spectrum bins)
+STEP void whiten(const state *s, quad floor, spectrum bins)
 {
     vec floors = both(floor);
-    for (long at = 4 * (s->first_bin & ~1L); at <= 4 * (s->last_bin | 1L); at += WIDTH) {
+    long end = 4 * ((s->last_bin | 1L) + 1);
+    for (long at = 4 * (s->first_bin & ~1L); at < end; at += WIDTH) {
         vec re = load(bins.re + at), im = load(bins.im + at);
         vec scale = inverse_root(re * re + im * im + floors);
         store(bins.re + at, re * scale);
@@ -123,12 +130,10 @@ INLINE void coarse_bins(const state *s, spectrum i, spectrum j, const enum turn 
         return;
     }
     long decimation = s->decimation;
-    memset(coarse.re, 0, sizeof(quad) * (size_t)s->coarse);
-    memset(coarse.im, 0, sizeof(quad) * (size_t)s->coarse);
+    vec sum_re[TAPS] = {0}, sum_im[TAPS] = {0};
     float *to_re = coarse.re, *to_im = coarse.im;
     for (long block = first & -decimation; block < end; block += decimation, to_re += 4, to_im += 4) {
         long from = block > first ? block : first, till = block + decimation < end ? block + decimation : end;
-        vec sum_re[TAPS] = {0}, sum_im[TAPS] = {0};
         for (long k = from; k < till; k += QUADS) {
             const float *weight = s->weights + 4 * (k - block);
             vec re, im;
@@ -138,14 +143,35 @@ INLINE void coarse_bins(const state *s, spectrum i, spectrum j, const enum turn 
                 sum_im[tap] += load(weight) * im;
             }
         }
-        for (int tap = 0; tap < TAPS; tap++) {
-            store_quad(to_re + 4 * tap, load_quad(to_re + 4 * tap) + folded(sum_re[tap]));
-            store_quad(to_im + 4 * tap, load_quad(to_im + 4 * tap) + direction * folded(sum_im[tap]));
-        }
+        /* The blocks to come no longer reach the first of the coarse bins; the others move up. */
+        store_quad(to_re, folded(sum_re[0]));
+        store_quad(to_im, folded(sum_im[0]) * direction);
+        for (int tap = 1; tap < TAPS; tap++)
+            sum_re[tap - 1] = sum_re[tap], sum_im[tap - 1] = sum_im[tap];
+        sum_re[TAPS - 1] = sum_im[TAPS - 1] = all(0.0f);
+    }
+    for (int tap = 0; tap < TAPS - 1; tap++, to_re += 4, to_im += 4) {
+        store_quad(to_re, folded(sum_re[tap]));
+        store_quad(to_im, folded(sum_im[tap]) * direction);
     }
 }
 
-INLINE void turn_coarse(const state *s, const float *phasors, spectrum coarse)
+#define COARSE_BINS(name, turn)                                                                              \
+    STEP void name(const state *s, spectrum i, spectrum j, quad direction, spectrum coarse)                  \
+    {                                                                                                        \
+        coarse_bins(s, i, j, turn, direction, coarse);                                                       \
+    }
+COARSE_BINS(coarse_bins_ring3, TURN_RING3)
+COARSE_BINS(coarse_bins_0, TURN_0)
+COARSE_BINS(coarse_bins_1, TURN_1)
+COARSE_BINS(coarse_bins_2, TURN_2)
+COARSE_BINS(coarse_bins_3, TURN_3)
+static void (*const COARSE_BINS_OF[TURNS])(const state *, spectrum, spectrum, quad, spectrum) = {
+    [TURN_RING3] = coarse_bins_ring3, [TURN_0] = coarse_bins_0, [TURN_1] = coarse_bins_1,
+    [TURN_2] = coarse_bins_2,         [TURN_3] = coarse_bins_3,
+};
+
+STEP void turn_coarse(const state *s, const float *phasors, spectrum coarse)
 {
     for (long c = 0; c < s->coarse; c++) {
         quad re = load_quad(coarse.re + 4 * c), im = load_quad(coarse.im + 4 * c);
@@ -189,6 +215,15 @@ INLINE void lags_of(const int PAIRS, const state *s, long centre, const int32_t 
     }
 }
 
+#define LAGS_OF(name, PAIRS)                                                                                 \
+    STEP void name(const state *s, long centre, const int32_t *lane, const int32_t *row, spectrum coarse,    \
+                   float *out)                                                                               \
+    {                                                                                                        \
+        lags_of(PAIRS, s, centre, lane, row, coarse, out);                                                   \
+    }
+LAGS_OF(lags_of_3, 3)
+LAGS_OF(lags_of_1, 1)
+
 INLINE void lags(const state *s, const locagen_product *p, spectrum coarse, float *out)
 {
     if (s->blocks > 1)
@@ -198,10 +233,10 @@ INLINE void lags(const state *s, const locagen_product *p, spectrum coarse, floa
         if (block > 0)
             turn_coarse(s, s->step, coarse);
         if (p->pairs == 3)
-            lags_of(3, s, centre, p->lane, p->row, coarse, out);
+            lags_of_3(s, centre, p->lane, p->row, coarse, out);
         else
             for (int n = 0; n < p->pairs; n++)
-                lags_of(1, s, centre, p->lane + n, p->row + n, coarse, out);
+                lags_of_1(s, centre, p->lane + n, p->row + n, coarse, out);
     }
 }
 
@@ -219,23 +254,7 @@ INLINE int frame_path(const state *s, const float *in, float *correlation, float
         spectrum i = {s->bins_re[p->group_i], s->bins_im[p->group_i]};
         spectrum j = {s->bins_re[p->group_j], s->bins_im[p->group_j]};
         quad direction = load_quad(p->direction);
-        switch (p->turn) {
-        case TURN_RING3:
-            coarse_bins(s, i, j, TURN_RING3, direction, coarse);
-            break;
-        case TURN_0:
-            coarse_bins(s, i, j, TURN_0, direction, coarse);
-            break;
-        case TURN_1:
-            coarse_bins(s, i, j, TURN_1, direction, coarse);
-            break;
-        case TURN_2:
-            coarse_bins(s, i, j, TURN_2, direction, coarse);
-            break;
-        default:
-            coarse_bins(s, i, j, TURN_3, direction, coarse);
-            break;
-        }
+        COARSE_BINS_OF[p->turn](s, i, j, direction, coarse);
         lags(s, p, coarse, correlation);
     }
     return bad;

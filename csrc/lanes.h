@@ -15,6 +15,8 @@
 #endif
 #define QUADS (WIDTH / 4)
 #define INLINE static inline __attribute__((always_inline))
+/* A step of the way that keeps the registers to itself: in one large function they spill. */
+#define STEP static __attribute__((noinline))
 
 typedef float quad __attribute__((vector_size(16)));
 typedef float vec __attribute__((vector_size(4 * WIDTH)));
