@@ -181,7 +181,7 @@ def is_confirmed(track: Track) -> bool:
     return (
         track.confidence >= CONFIRM_CONFIDENCE
         and track.age_s >= CONFIRM_AGE_S
-        and math.isfinite(track.azimuth_rad)
+        and not math.isnan(compass_deg(track.azimuth_rad))
     )
 
 
@@ -191,10 +191,8 @@ def bearing_values(track: Track, snr_db: float, heading_rad: float | None) -> It
     An infinite sigma is the most there is, 180 degrees: a missing value would leave the last good one on
     the ground station's screen.
     """
-    azimuth, true = track.azimuth_rad, _true_azimuth(track, heading_rad)
-    yield from _value("LG_AZB", compass_deg(azimuth), 0, 360)
-    if true is not None:
-        yield from _value("LG_AZ", compass_deg(true), 0, 360)
+    yield from _value("LG_AZB", compass_deg(track.azimuth_rad), 0, 360)
+    yield from _value("LG_AZ", _true_deg(track, heading_rad), 0, 360)
     if track.elevation_rad is not None:
         yield from _value("LG_EL", math.degrees(track.elevation_rad), -90, 90)
     yield from _value("LG_SIG", math.degrees(track.azimuth_sigma_rad), 0, 180)
@@ -203,23 +201,22 @@ def bearing_values(track: Track, snr_db: float, heading_rad: float | None) -> It
 
 
 def call_text(track: Track, heading_rad: float | None) -> str:
-    """One line for the operator, at most 50 characters: where a call comes from, with its 1-sigma."""
-    body, true = _whole_deg(track.azimuth_rad), _true_azimuth(track, heading_rad)
+    """One line for the operator, at most 50 characters: where a confirmed call comes from, and its 1-sigma."""
+    body, true = _whole(compass_deg(track.azimuth_rad)), _true_deg(track, heading_rad)
     where = f"{body} deg clockwise from nose"
-    if true is not None:
-        where = f"{_whole_deg(true)} deg true, {body} from nose"
+    if not math.isnan(true):
+        where = f"{_whole(true)} deg true, {body} from nose"
     sigma = math.degrees(track.azimuth_sigma_rad)
     return f"Call heard: {where}" + (f", +-{max(1, round(sigma))} deg" if 0 <= sigma <= 180 else "")
 
 
-def _true_azimuth(track: Track, heading_rad: float | None) -> float | None:
-    if heading_rad is None or not math.isfinite(heading_rad):
-        return None
-    return track.azimuth_rad + heading_rad
+def _true_deg(track: Track, heading_rad: float | None) -> float:
+    """Azimuth from true north, [0, 360); NaN where the heading is not known."""
+    return math.nan if heading_rad is None else compass_deg(track.azimuth_rad + heading_rad)
 
 
-def _whole_deg(angle_rad: float) -> str:
-    return f"{round(compass_deg(angle_rad)) % 360:03d}"
+def _whole(degrees: float) -> str:
+    return f"{round(degrees) % 360:03d}"
 
 
 def _value(name: str, value: float, least: float, most: float) -> Iterator[tuple[str, float]]:
@@ -235,11 +232,7 @@ def _is_autopilot(packet: Packet) -> bool:
     if packet.component_id != dialect.COMPONENT_AUTOPILOT or packet.system_id in (0, _GROUND_STATION_ID):
         return False
     message = dialect.decode(packet.raw)
-    is_ground, flies = (
-        message.type == dialect.TYPE_GROUND_STATION,
-        message.autopilot != dialect.AUTOPILOT_NONE,
-    )
-    return flies and not is_ground
+    return bool(message.type != dialect.TYPE_GROUND_STATION and message.autopilot != dialect.AUTOPILOT_NONE)
 
 
 class _Every:
