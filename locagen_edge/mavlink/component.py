@@ -201,7 +201,7 @@ def bearing_values(track: Track, snr_db: float, heading_rad: float | None) -> It
 
 
 def call_text(track: Track, heading_rad: float | None) -> str:
-    """One line for the operator, at most 50 characters: where a confirmed call comes from, and its 1-sigma."""
+    """One line for the operator, at most 50 characters: where a confirmed call comes from, with 1-sigma."""
     body, true = _whole(compass_deg(track.azimuth_rad)), _true_deg(track, heading_rad)
     where = f"{body} deg clockwise from nose"
     if not math.isnan(true):
