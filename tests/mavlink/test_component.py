@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -351,12 +353,14 @@ def test_texts_keep_their_distance_and_the_overflow_is_counted() -> None:
     assert told[-1][0] >= (len(told) - 1) * voice.TEXT_S
 
 
-def test_a_call_goes_before_faults() -> None:
+def test_a_call_goes_before_faults_even_when_the_queue_is_full() -> None:
     component = Component(MavlinkSettings())
     flood = tuple(f"fault {k}" for k in range(20))
     component.due(0.0, replace(QUIET, faults=flood))
-    told = texts(said(component, replace(CALLING, faults=flood), 3, 0.1))
+    told = texts(said(component, replace(CALLING, faults=(*flood, "one more")), 9, 0.1))
     assert told[0].startswith("Call heard")
+    assert told[1:] == [f"fault {k}" for k in range(1, voice.TEXTS_WAITING)], "the newest made room"
+    assert component.texts_dropped == 20 - voice.TEXTS_WAITING + 1
 
 
 def test_when_the_link_comes_up_what_holds_is_told_again() -> None:
@@ -414,3 +418,11 @@ def test_sent_counts_by_name() -> None:
         "STATUSTEXT": 1,
         **dict.fromkeys(("LG_AZB", "LG_EL", "LG_SIG", "LG_CONF", "LG_SNR"), 20),
     }
+
+
+def test_nothing_here_imports_the_blocking_mavutil() -> None:
+    code = (
+        "import sys, locagen_edge.mavlink.component, locagen_edge.mavlink.link;"
+        "sys.exit('pymavlink.mavutil' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -153,6 +153,12 @@ def test_an_unknown_id_does_not_make_it_wait() -> None:
     assert raws(Framer().feed(b"\xfd\xff\x00\x00\x00\x01\x01\xff\xff\xff" + heartbeat)) == [heartbeat]
 
 
+def test_a_length_that_no_message_has_does_not_make_it_wait() -> None:
+    """MAVLink 1 has no extension fields: a HEARTBEAT of 255 bytes is noise."""
+    (heartbeat,) = frames(1)
+    assert raws(Framer().feed(b"\xfe\xff\x00\x01\x01\x00" + heartbeat)) == [heartbeat]
+
+
 def test_flags_that_are_not_understood_drop_the_frame() -> None:
     """Its length is not known then: the specification says to drop it."""
     flagged = bytearray(frames(1)[0])
