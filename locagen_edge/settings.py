@@ -259,7 +259,7 @@ class MavlinkSettings:
         "udpout:127.0.0.1:14550",
         "`udpout:HOST:PORT` sends there, `udpin:HOST:PORT` listens, `tcp:HOST:PORT` connects, "
         "`serial:DEVICE:BAUD` opens a UART.",
-        pattern=r"(udpout|udpin|tcp):[^:\s]+:\d{1,5}|serial:[^:\s]+:\d{3,8}",
+        pattern=r"(udpout|udpin|tcp):[^:\s]+:\d{1,5}|serial:\S+:\d{3,8}",
     )
     system_id: int = setting(
         0,

@@ -1,0 +1,342 @@
+"""The road for MAVLink bytes: UDP, TCP or a UART, kept open on asyncio.
+
+The daemon has to go on hearing whatever happens here, so nothing in this file blocks, raises or queues
+without bound: a frame that cannot go now is dropped and counted, because a bearing is worth nothing late.
+A road that fails is opened again with exponential back-off and some jitter, for ever; the log gets one
+line when it fails and one when it holds again, not one per attempt.
+
+pymavlink's own `mavutil` would be shorter; it blocks, and it takes 186 ms and 31 MB to import.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import os
+import random
+import socket
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import serial  # type: ignore[import-untyped]
+import serial_asyncio_fast
+
+from locagen_edge.errors import LinkError
+
+OPEN_S = 5.0
+"""longest an attempt to open may take: TCP alone would try for two minutes"""
+CLOSE_S = 0.3
+"""longest we wait for a closed road to be gone"""
+FIRST_WAIT_S = 0.2
+"""first wait before opening again; doubled each time"""
+STEADY_S = 1.0
+"""a road counts as holding again (log, back-off) when it has lasted this long: some open and fail at once"""
+PEER_S = 30.0
+"""udpin: how long a peer that fell silent is still sent to"""
+PEERS = 8
+"""udpin: most peers at a time"""
+BUFFERED = 4096
+"""tcp, serial: bytes that may wait in our own buffer: 0.7 s at 57600 baud"""
+KERNEL_BUFFER = 16384
+"""tcp: bytes that may wait in the kernel's; its default grows to megabytes of old bearings"""
+PEER_GONE_MS = 10_000
+"""tcp: a peer that acknowledges nothing for so long is gone (pulled cable); the default is 15 minutes"""
+
+_MAGIC = (0xFD, 0xFE)
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """A link as the settings name it."""
+
+    scheme: str
+    target: str
+    """host or device"""
+    number: int
+    """port or baud rate"""
+
+    def __str__(self) -> str:
+        return f"{self.scheme}:{self.target}:{self.number}"
+
+
+def parse(text: str) -> Spec:
+    """`udpout:HOST:PORT`, `udpin:HOST:PORT`, `tcp:HOST:PORT` or `serial:DEVICE:BAUD`.
+
+    Raises `LinkError` with one line that says what is wrong.
+    """
+    scheme, _, rest = text.partition(":")
+    target, _, digits = rest.rpartition(":")  # a device may have colons: /dev/serial/by-path/...
+    if scheme not in OPENERS:
+        raise LinkError(f"mavlink.link: {text!r}: begins with none of {', '.join(OPENERS)}")
+    noun, most = ("baud rate", 10_000_000) if scheme == "serial" else ("port", 65535)
+    if not target:
+        raise LinkError(f"mavlink.link: {text!r}: is not {scheme}:NAME:NUMBER")
+    if not (digits.isascii() and digits.isdigit()) or not 1 <= int(digits[:9]) <= most:
+        raise LinkError(f"mavlink.link: {text!r}: {noun} {digits!r} is not a number from 1 to {most}")
+    return Spec(scheme, target, int(digits))
+
+
+class Link:
+    """One link. `run` keeps it open, `send` gives it a frame, `on_bytes` gets what comes in."""
+
+    def __init__(self, spec: Spec, *, backoff_s: float, on_bytes: Callable[[bytes], None]) -> None:
+        self.spec = spec
+        self._backoff_s = backoff_s
+        self._on_bytes = on_bytes
+        self._port: _Port | None = None
+        self._told_up: bool | None = None
+        self._opened = 0
+        self.sent = 0
+        """frames handed to the system"""
+        self.sent_bytes = 0
+        self.dropped = 0
+        """frames that did not go: link down, nobody to send to, or too much waiting"""
+        self.received_bytes = 0
+        self.refused = 0
+        """udpout: times that the other end said nobody listens there; normal while it starts"""
+        self.last_error = ""
+
+    @property
+    def up(self) -> bool:
+        """Whether a frame sent now has somewhere to go."""
+        return self._port is not None and self._port.ready
+
+    @property
+    def reopened(self) -> int:
+        """Times that the link was opened after the first."""
+        return max(0, self._opened - 1)
+
+    def send(self, frame: bytes) -> bool:
+        """Sends one frame, or drops and counts it. Never waits. True: it is on its way."""
+        if self._port is None or not self._port.write(frame):
+            self.dropped += 1
+            return False
+        self.sent += 1
+        self.sent_bytes += len(frame)
+        return True
+
+    def take(self, data: bytes) -> None:
+        """For the port: bytes have come."""
+        self.received_bytes += len(data)
+        self._on_bytes(data)
+
+    async def run(self) -> None:
+        """Opens the link and keeps it open until cancelled."""
+        wait_s = FIRST_WAIT_S
+        while True:
+            if await self._once():
+                wait_s = FIRST_WAIT_S
+            wait_s = min(wait_s, self._backoff_s)
+            await asyncio.sleep(wait_s * random.uniform(0.75, 1.0))  # not all drones in one beat
+            wait_s *= 2
+
+    async def _once(self) -> bool:
+        """Opens the link, and returns when it has failed: whether it had held for a while."""
+        steady = False
+        try:
+            async with asyncio.timeout(OPEN_S):
+                self._port = port = await OPENERS[self.spec.scheme](self)
+        except (OSError, ValueError) as error:  # ValueError: a baud rate or host name that cannot be
+            self._tell_down(error)
+            return False
+        self._opened += 1
+        try:
+            await asyncio.wait({port.lost}, timeout=STEADY_S)
+            steady = not port.lost.done()
+            if steady:
+                self._tell_up()
+            self._tell_down(await asyncio.shield(port.lost))
+        finally:
+            self._port = None
+            port.abort()
+            await asyncio.wait({port.lost}, timeout=CLOSE_S)
+        return steady
+
+    def _tell_up(self) -> None:
+        if self._told_up is not True:
+            _log.info("mavlink link %s: up", self.spec)
+        self._told_up = True
+
+    def _tell_down(self, error: Exception | None) -> None:
+        self.last_error = _in_words(error)
+        if self._told_up is not False:
+            _log.warning(
+                "mavlink link %s: down: %s; trying again at least every %g s",
+                self.spec,
+                self.last_error,
+                self._backoff_s,
+            )
+        self._told_up = False
+
+
+def _in_words(error: Exception | None) -> str:
+    """Why a link is down, for people."""
+    if error is None:
+        return "closed by the other end"
+    if isinstance(error, TimeoutError) and not error.errno:
+        return f"no answer within {OPEN_S:g} s"
+    if (
+        isinstance(error, OSError)
+        and error.errno
+        and not isinstance(error, socket.gaierror | serial.SerialException)
+    ):
+        return os.strerror(error.errno)  # asyncio's own text names the address again instead of the reason
+    return str(getattr(error, "strerror", None) or error)
+
+
+# --- ports: one open road each ------------------------------------------------------------------------
+
+
+class _Port(asyncio.BaseProtocol):
+    """What all have in common. `lost` ends, with the reason or None, when the road is gone."""
+
+    transport: Any
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.lost: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
+        self._reason: Exception | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = transport
+
+    def connection_lost(self, error: Exception | None) -> None:
+        if not self.lost.done():
+            self.lost.set_result(self._reason or error)
+
+    def abort(self) -> None:
+        if not self.transport.is_closing():
+            self.transport.abort()
+
+    @property
+    def ready(self) -> bool:
+        return not self.transport.is_closing()
+
+    def write(self, frame: bytes) -> bool:
+        raise NotImplementedError
+
+
+class _Stream(_Port, asyncio.Protocol):
+    """tcp and serial."""
+
+    def data_received(self, data: bytes) -> None:
+        self.link.take(data)
+
+    def write(self, frame: bytes) -> bool:
+        if not self.ready or self.transport.get_write_buffer_size() + len(frame) > BUFFERED:
+            return False
+        self.transport.write(frame)
+        return True
+
+
+class _UdpOut(_Port, asyncio.DatagramProtocol):
+    """A connected UDP socket: it hears of ICMP errors, and only its peer can answer."""
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:  # noqa: ARG002
+        self.link.take(data)
+
+    def error_received(self, error: Exception) -> None:
+        if isinstance(error, ConnectionRefusedError):
+            self.link.refused += 1
+            return
+        if getattr(error, "errno", None) == errno.ENOBUFS:
+            return  # the interface's queue is full: this frame is lost, the socket is well
+        # No route, no interface, an address that is no longer ours: only a new socket will do.
+        self._reason = error
+        self.abort()
+
+    def write(self, frame: bytes) -> bool:
+        if not self.ready or self.transport.get_write_buffer_size() > BUFFERED:
+            return False
+        self.transport.sendto(frame)
+        return super().ready  # an error just now has closed it
+
+
+class _UdpIn(_UdpOut):
+    """Listens, and sends to all that were heard of late."""
+
+    def __init__(self, link: Link) -> None:
+        super().__init__(link)
+        self._peers: dict[Any, float] = {}  # address: when last heard
+
+    @property
+    def ready(self) -> bool:
+        return super().ready and bool(self._fresh())
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        if data[:1] and data[0] in _MAGIC:  # a port scan is no peer
+            peers = self._fresh()
+            if addr in peers or len(peers) < PEERS:
+                peers[addr] = asyncio.get_running_loop().time()
+        self.link.take(data)
+
+    def error_received(self, error: Exception) -> None:
+        self.link.last_error = _in_words(error)  # about one peer of several: the socket stays
+
+    def write(self, frame: bytes) -> bool:
+        if not self.ready or self.transport.get_write_buffer_size() > BUFFERED:
+            return False
+        for peer in self._peers:
+            self.transport.sendto(frame, peer)
+        return True
+
+    def _fresh(self) -> dict[Any, float]:
+        oldest = asyncio.get_running_loop().time() - PEER_S
+        for peer in [peer for peer, heard in self._peers.items() if heard < oldest]:
+            del self._peers[peer]
+        return self._peers
+
+
+class _SerialTransport(serial_asyncio_fast.SerialTransport):
+    """pyserial-asyncio-fast, except that a device pulled out while we write is no traceback in the log."""
+
+    def _fatal_error(self, exc: BaseException, message: str = "") -> None:  # noqa: ARG002
+        self._abort(exc)
+
+
+# --- openers ------------------------------------------------------------------------------------------
+
+
+async def _open_udpout(link: Link) -> _Port:
+    address = (link.spec.target, link.spec.number)
+    loop = asyncio.get_running_loop()
+    _, port = await loop.create_datagram_endpoint(lambda: _UdpOut(link), remote_addr=address)
+    return port
+
+
+async def _open_udpin(link: Link) -> _Port:
+    address = (link.spec.target, link.spec.number)
+    loop = asyncio.get_running_loop()
+    _, port = await loop.create_datagram_endpoint(lambda: _UdpIn(link), local_addr=address)
+    return port
+
+
+async def _open_tcp(link: Link) -> _Port:
+    loop = asyncio.get_running_loop()
+    transport, port = await loop.create_connection(lambda: _Stream(link), link.spec.target, link.spec.number)
+    connection = transport.get_extra_info("socket")
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BUFFER)
+    if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, PEER_GONE_MS)
+    return port
+
+
+async def _open_serial(link: Link) -> _Port:
+    # Opening a USB adapter takes tens of milliseconds: not on the loop that carries sound.
+    # exclusive: two programs on one UART each get half of the bytes, and neither is told.
+    device = await asyncio.to_thread(
+        serial.Serial, link.spec.target, baudrate=link.spec.number, exclusive=True
+    )
+    port = _Stream(link)
+    # The transport calls connection_made too, but only in the loop's next round.
+    port.connection_made(_SerialTransport(asyncio.get_running_loop(), port, device))
+    return port
+
+
+OPENERS: Mapping[str, Callable[[Link], Awaitable[_Port]]] = MappingProxyType(
+    {"udpout": _open_udpout, "udpin": _open_udpin, "tcp": _open_tcp, "serial": _open_serial}
+)

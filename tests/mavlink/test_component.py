@@ -1,0 +1,428 @@
+"""Laws of what we say: cadence over simulated time, once per event, and nothing that acts on flight."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common
+
+from locagen_edge.mavlink import component as voice
+from locagen_edge.mavlink.component import Component, Status
+from locagen_edge.settings import MavlinkSettings
+from locagen_edge.types import Track
+
+TICK_S = 0.0512  # the pipeline's hop
+TRACK = Track(
+    azimuth_rad=math.radians(42.0),
+    azimuth_sigma_rad=math.radians(3.0),
+    elevation_rad=math.radians(-20.0),
+    elevation_sigma_rad=math.radians(5.0),
+    age_s=0.6,
+    silent_s=0.0,
+    confidence=0.9,
+)
+QUIET = Status(hearing=True, track=None, snr_db=-3.0, faults=())
+CALLING = replace(QUIET, track=TRACK, snr_db=6.0)
+DEAF = replace(CALLING, hearing=False)
+
+
+def decode(frames: list[bytes]) -> list[Any]:
+    """What pymavlink's own parser, our peer here, reads in these frames."""
+    peer = common.MAVLink(None)
+    messages = [message for frame in frames for message in peer.parse_buffer(frame) or ()]
+    assert len(messages) == len(frames)
+    return messages
+
+
+def speak(
+    component: Component, status: Status, seconds: float, start_s: float = 0.0
+) -> Iterator[tuple[float, Any]]:
+    """Time and message of all that is said while the status stays."""
+    for tick in range(round(seconds / TICK_S)):
+        now_s = start_s + tick * TICK_S
+        for message in decode(component.due(now_s, status)):
+            yield now_s, message
+
+
+def said(component: Component, status: Status, seconds: float, start_s: float = 0.0) -> list[Any]:
+    return [message for _, message in speak(component, status, seconds, start_s)]
+
+
+def texts(messages: list[Any]) -> list[str]:
+    return [m.text for m in messages if m.get_type() == "STATUSTEXT"]
+
+
+def values(messages: list[Any]) -> dict[str, float]:
+    """The last of each named value."""
+    return {m.name: m.value for m in messages if m.get_type() == "NAMED_VALUE_FLOAT"}
+
+
+def heartbeat(
+    system: int, component: int = 1, *, type: int = common.MAV_TYPE_QUADROTOR, autopilot: int = 3
+) -> bytes:
+    message = common.MAVLink_heartbeat_message(type, autopilot, 81, 0, 4, 3)
+    return bytes(message.pack(common.MAVLink(None, system, component)))
+
+
+# --- heartbeat ----------------------------------------------------------------------------------------
+
+
+def test_a_heartbeat_every_second_and_what_it_says() -> None:
+    beats = [(t, m) for t, m in speak(Component(MavlinkSettings()), QUIET, 60) if m.get_type() == "HEARTBEAT"]
+    assert len(beats) == 60
+    for k, (now_s, message) in enumerate(beats):
+        assert now_s == pytest.approx(k, abs=2 * TICK_S)  # no drift: late by the loop's tick at most
+        assert message.type == common.MAV_TYPE_ONBOARD_CONTROLLER
+        assert message.autopilot == common.MAV_AUTOPILOT_INVALID
+        assert message.system_status == common.MAV_STATE_ACTIVE
+        assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
+
+
+def test_a_deaf_daemon_has_no_heartbeat_and_gives_no_bearing() -> None:
+    assert said(Component(MavlinkSettings()), DEAF, 30) == []
+
+
+def test_the_heartbeat_stops_with_the_hearing_and_returns_with_it_at_once() -> None:
+    component = Component(MavlinkSettings())
+    said(component, QUIET, 10)
+    assert said(component, DEAF, 10, 10.0) == []
+    first = component.due(20.3, QUIET)
+    assert [m.get_type() for m in decode(first)] == ["HEARTBEAT"]
+
+
+def test_a_microphone_fault_shows_in_the_heartbeat_while_it_lasts() -> None:
+    component = Component(MavlinkSettings())
+    ill = replace(QUIET, faults=("microphone 2 is silent",))
+    states = [
+        [m.system_status for m in said(component, status, 3, start_s) if m.get_type() == "HEARTBEAT"]
+        for start_s, status in ((0.0, QUIET), (3.0, ill), (6.0, QUIET))
+    ]
+    assert states == [
+        [common.MAV_STATE_ACTIVE] * 3,
+        [common.MAV_STATE_CRITICAL] * 3,
+        [common.MAV_STATE_ACTIVE] * 3,
+    ]
+
+
+# --- system id ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stranger", "why"),
+    [
+        (heartbeat(255, 190, type=common.MAV_TYPE_GCS, autopilot=8), "ground station"),
+        (heartbeat(255, 1), "an autopilot with the ground station's id"),
+        (heartbeat(245, 1, type=common.MAV_TYPE_GCS, autopilot=8), "ground station as component 1"),
+        (heartbeat(9, 154, type=common.MAV_TYPE_GIMBAL, autopilot=8), "gimbal"),
+        (heartbeat(9, 191, type=common.MAV_TYPE_ONBOARD_CONTROLLER, autopilot=8), "another companion"),
+        (heartbeat(9, 1, autopilot=8), "component 1 that is no autopilot"),
+        (heartbeat(0, 1), "system 0 means all"),
+    ],
+)
+def test_only_an_autopilot_teaches_the_system_id(stranger: bytes, why: str) -> None:
+    component = Component(MavlinkSettings())
+    component.receive(stranger, 0.0)
+    assert component.system_id == 1, why
+    assert component.autopilot_heard_s is None
+    component.receive(heartbeat(42), 1.0)
+    component.receive(stranger, 2.0)
+    assert component.system_id == 42, why
+    assert component.autopilot_heard_s == 1.0
+
+
+def test_what_is_learnt_is_what_is_sent() -> None:
+    component = Component(MavlinkSettings(component_id=193))
+    component.receive(b"\x00\xfd" + heartbeat(42), 0.0)
+    messages = said(component, CALLING, 2)
+    assert {(m.get_srcSystem(), m.get_srcComponent()) for m in messages} == {(42, 193)}
+    assert [m.get_seq() for m in messages] == list(range(len(messages)))
+
+
+def test_a_second_vehicle_is_not_followed_while_ours_lives() -> None:
+    component = Component(MavlinkSettings())
+    for second in range(60):
+        component.receive(heartbeat(3) + heartbeat(4), float(second))
+        assert component.system_id == 3
+    component.receive(heartbeat(4), 59 + voice.AUTOPILOT_SILENT_S)
+    assert component.system_id == 3
+    component.receive(heartbeat(4), 59.1 + voice.AUTOPILOT_SILENT_S)
+    assert component.system_id == 4  # rebooted under a new id
+
+
+def test_an_id_from_the_settings_stays() -> None:
+    component = Component(MavlinkSettings(system_id=17))
+    component.receive(heartbeat(3), 0.0)
+    assert (component.system_id, component.autopilot_heard_s) == (17, None)
+    component.receive(heartbeat(17), 100.0)
+    assert (component.system_id, component.autopilot_heard_s) == (17, 100.0)
+
+
+@given(st.lists(st.tuples(st.integers(0, 255), st.integers(0, 255), st.sampled_from([2, 6, 18]))))
+def test_never_system_id_255_or_0(beats: list[tuple[int, int, int]]) -> None:
+    component = Component(MavlinkSettings())
+    for now, (system, comp, kind) in enumerate(beats):
+        component.receive(heartbeat(system, comp, type=kind), 100.0 * now)
+        assert 1 <= component.system_id <= 254
+
+
+# --- named values -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 2.0, 5.0])
+def test_values_come_at_the_rate_of_the_settings_while_a_track_lives(rate_hz: float) -> None:
+    component = Component(MavlinkSettings(rate_hz=rate_hz))
+    names = Counter(m.name for m in said(component, CALLING, 20) if m.get_type() == "NAMED_VALUE_FLOAT")
+    assert names == dict.fromkeys(("LG_AZB", "LG_EL", "LG_SIG", "LG_CONF", "LG_SNR"), 20 * rate_hz)
+    assert values(said(component, QUIET, 20, 20.0)) == {}
+
+
+def test_a_new_track_is_sent_at_once() -> None:
+    component = Component(MavlinkSettings(rate_hz=0.1))
+    said(component, QUIET, 5)
+    assert "LG_AZB" in values(decode(component.due(5.01, CALLING)))
+
+
+def test_values_are_what_the_track_says() -> None:
+    got = values(said(Component(MavlinkSettings()), replace(CALLING, heading_rad=math.radians(330)), 1))
+    wanted = {"LG_AZB": 42.0, "LG_AZ": 12.0, "LG_EL": -20.0, "LG_SIG": 3.0, "LG_CONF": 0.9, "LG_SNR": 6.0}
+    assert got == pytest.approx(wanted, rel=1e-6)  # float32
+
+
+def test_what_is_not_known_is_not_sent() -> None:
+    flat = replace(CALLING, track=replace(TRACK, elevation_rad=None))
+    assert set(values(said(Component(MavlinkSettings()), flat, 1))) == {
+        "LG_AZB",
+        "LG_SIG",
+        "LG_CONF",
+        "LG_SNR",
+    }
+
+
+@pytest.mark.parametrize(
+    ("azimuth_rad", "degrees"),
+    [
+        (-0.0, 0.0),
+        (0.0, 0.0),
+        (-1e-17, 0.0),
+        (-1e-9, 0.0),  # 359.99999994 is 360 in float32
+        (-math.pi, 180.0),
+        (math.pi, 180.0),
+        (-math.pi / 2, 270.0),
+        (math.radians(359.9999), 359.9999),
+        (math.radians(725.0), 5.0),
+    ],
+)
+def test_azimuth_is_from_0_to_below_360(azimuth_rad: float, degrees: float) -> None:
+    status = replace(CALLING, track=replace(TRACK, azimuth_rad=azimuth_rad), heading_rad=0.0)
+    got = values(said(Component(MavlinkSettings()), status, 1))
+    for name in ("LG_AZB", "LG_AZ"):
+        assert got[name] == pytest.approx(degrees, abs=1e-4)
+        assert 0.0 <= got[name] < 360.0
+        assert math.copysign(1.0, got[name]) == 1.0
+
+
+ANY = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf, -0.0, 1e308, 5e-324])
+
+
+@given(ANY, ANY, ANY | st.none(), ANY, ANY, ANY | st.none())
+def test_no_number_raises_or_leaves_its_range(
+    azimuth: float,
+    sigma: float,
+    elevation: float | None,
+    confidence: float,
+    snr: float,
+    heading: float | None,
+) -> None:
+    track = Track(azimuth, sigma, elevation, 0.1, 1.0, 0.0, confidence)
+    status = Status(True, track, snr, (), heading)
+    got = values(said(Component(MavlinkSettings(), start_s=-1e6), status, 0.2))
+    limits = {"LG_AZB": 360, "LG_AZ": 360, "LG_EL": 90, "LG_SIG": 180, "LG_CONF": 1, "LG_SNR": 200}
+    assert all(abs(value) <= limits[name] for name, value in got.items())  # NaN would fail too
+
+
+def test_nothing_known_of_the_azimuth_is_a_sigma_of_180() -> None:
+    lost = replace(CALLING, track=replace(TRACK, azimuth_sigma_rad=math.inf))
+    assert values(said(Component(MavlinkSettings()), lost, 1))["LG_SIG"] == 180.0
+    broken = replace(CALLING, track=replace(TRACK, azimuth_sigma_rad=math.nan))
+    assert "LG_SIG" not in values(said(Component(MavlinkSettings()), broken, 1))
+
+
+def test_time_counts_from_the_start_and_wraps_at_32_bits() -> None:
+    def stamps(start_s: float, now_s: float) -> set[int]:
+        messages = decode(Component(MavlinkSettings(), start_s=start_s).due(now_s, CALLING))
+        return {m.time_boot_ms for m in messages if m.get_type() == "NAMED_VALUE_FLOAT"}
+
+    assert stamps(100.0, 101.25) == {1250}
+    assert stamps(0.0, 2**32 / 1000) == {0}
+    assert stamps(0.0, 2**32 / 1000 + 1.5) == {1500}
+
+
+# --- texts --------------------------------------------------------------------------------------------
+
+
+def test_a_confirmed_call_is_told_once() -> None:
+    component = Component(MavlinkSettings())
+    heard = [m for m in said(component, CALLING, 60) if m.get_type() == "STATUSTEXT"]
+    assert [(m.severity, m.text) for m in heard] == [
+        (common.MAV_SEVERITY_NOTICE, "Call heard: 042 deg clockwise from nose, +-3 deg")
+    ]
+
+
+def test_with_a_heading_the_true_bearing_comes_first() -> None:
+    status = replace(CALLING, heading_rad=math.radians(330))
+    assert texts(said(Component(MavlinkSettings()), status, 1)) == [
+        "Call heard: 012 deg true, 042 from nose, +-3 deg"
+    ]
+
+
+@pytest.mark.parametrize("weak", [{"confidence": 0.49}, {"age_s": 0.29}, {"confidence": math.nan}])
+def test_a_call_that_is_not_confirmed_is_not_told(weak: dict[str, float]) -> None:
+    component = Component(MavlinkSettings())
+    assert texts(said(component, replace(CALLING, track=replace(TRACK, **weak)), 5)) == []
+    assert len(texts(said(component, CALLING, 5, 5.0))) == 1
+
+
+def test_a_call_born_again_is_told_again() -> None:
+    component = Component(MavlinkSettings())
+    later = replace(CALLING, track=replace(TRACK, age_s=9.0))
+    for start_s, status, told in (
+        (0.0, CALLING, 1),
+        (2.0, later, 0),  # the same one goes on
+        (4.0, QUIET, 0),
+        (6.0, CALLING, 1),  # died and came back
+        (8.0, later, 0),
+        (10.0, CALLING, 1),  # younger than it was: another one took its place
+    ):
+        assert len(texts(said(component, status, 2, start_s))) == told
+
+
+def test_a_pause_in_the_hearing_makes_no_new_call() -> None:
+    component = Component(MavlinkSettings())
+    for start_s, status, told in ((0.0, CALLING, 1), (2.0, DEAF, 0), (4.0, CALLING, 0)):
+        assert len(texts(said(component, status, 2, start_s))) == told
+
+
+def test_a_fault_is_told_once_and_once_more_when_it_has_gone() -> None:
+    component = Component(MavlinkSettings())
+    ill = replace(QUIET, faults=("microphone 2 is silent",))
+    told = [
+        (m.severity, m.text)
+        for start_s, status in ((0.0, ill), (20.0, QUIET))
+        for m in said(component, status, 20, start_s)
+        if m.get_type() == "STATUSTEXT"
+    ]
+    assert told == [
+        (common.MAV_SEVERITY_WARNING, "microphone 2 is silent"),
+        (common.MAV_SEVERITY_NOTICE, "Cleared: microphone 2 is silent"),
+    ]
+
+
+def test_a_fault_that_flickers_is_one_fault() -> None:
+    component = Component(MavlinkSettings())
+    ill = replace(QUIET, faults=("microphone 2 is silent",))
+    told = [
+        text
+        for tick in range(200)
+        for text in texts(decode(component.due(tick * TICK_S, (ill, QUIET)[tick % 2])))
+    ]
+    assert told == ["microphone 2 is silent"]
+
+
+def test_a_deaf_daemon_still_tells_its_faults() -> None:
+    lost = replace(DEAF, faults=("sound card is gone",))
+    messages = said(Component(MavlinkSettings()), lost, 10)
+    assert texts(messages) == ["sound card is gone"]
+    assert len(messages) == 1
+
+
+def test_texts_keep_their_distance_and_the_overflow_is_counted() -> None:
+    component = Component(MavlinkSettings())
+    flood = replace(QUIET, faults=tuple(f"fault {k}" for k in range(20)))
+    told = [(t, m.text) for t, m in speak(component, flood, 10) if m.get_type() == "STATUSTEXT"]
+    assert [text for _, text in told] == [f"fault {k}" for k in range(voice.TEXTS_WAITING)]
+    assert component.texts_dropped == 20 - voice.TEXTS_WAITING
+    assert told[-1][0] >= (len(told) - 1) * voice.TEXT_S
+
+
+def test_a_call_goes_before_faults_even_when_the_queue_is_full() -> None:
+    component = Component(MavlinkSettings())
+    flood = tuple(f"fault {k}" for k in range(20))
+    component.due(0.0, replace(QUIET, faults=flood))
+    told = texts(said(component, replace(CALLING, faults=(*flood, "one more")), 9, 0.1))
+    assert told[0].startswith("Call heard")
+    assert told[1:] == [f"fault {k}" for k in range(1, voice.TEXTS_WAITING)], "the newest made room"
+    assert component.texts_dropped == 20 - voice.TEXTS_WAITING + 1
+
+
+def test_when_the_link_comes_up_what_holds_is_told_again() -> None:
+    component = Component(MavlinkSettings())
+    ill = replace(CALLING, faults=("microphone 2 is silent",))
+    first = texts(said(component, ill, 5))
+    component.say_again()
+    assert texts(said(component, ill, 5, 5.0)) == first
+    assert len(first) == 2
+
+
+@given(st.text(max_size=120))
+def test_any_text_fits_and_stays_readable(words: str) -> None:
+    frames = Component(MavlinkSettings()).due(0.0, replace(QUIET, faults=(words,)))
+    (text,) = texts(decode(frames))
+    assert len(text) == min(50, len(words))
+    assert all(" " <= c <= "~" for c in text)
+    assert all(a == b or b == "?" for a, b in zip(words, text, strict=False))
+
+
+@given(st.floats(-10, 10), st.floats(0, 1e9) | st.just(math.nan), st.floats(-10, 10) | st.none())
+def test_a_calls_text_is_never_cut(azimuth: float, sigma: float, heading: float | None) -> None:
+    track = replace(TRACK, azimuth_rad=azimuth, azimuth_sigma_rad=sigma)
+    assert len(voice.call_text(track, heading)) <= 50
+
+
+# --- all of it ----------------------------------------------------------------------------------------
+
+STATUSES = st.builds(
+    Status,
+    hearing=st.booleans(),
+    track=st.none() | st.builds(Track, ANY, ANY, st.none() | ANY, ANY, ANY, ANY, ANY),
+    snr_db=ANY,
+    faults=st.lists(st.text(), max_size=3).map(tuple),
+    heading_rad=st.none() | ANY,
+)
+
+
+@given(st.lists(STATUSES, max_size=30), st.binary(max_size=300))
+def test_only_three_messages_ever_leave(statuses: list[Status], noise: bytes) -> None:
+    component = Component(MavlinkSettings())
+    ids: Counter[int] = Counter()
+    for k, status in enumerate(statuses):
+        component.receive(noise, k * 0.4)
+        ids.update(m.get_msgId() for m in decode(component.due(k * 0.4, status)))
+    assert set(ids) <= {0, 251, 253}
+    assert sum(ids.values()) == sum(component.sent.values())
+
+
+def test_sent_counts_by_name() -> None:
+    component = Component(MavlinkSettings())
+    said(component, CALLING, 10)
+    assert component.sent == {
+        "HEARTBEAT": 10,
+        "STATUSTEXT": 1,
+        **dict.fromkeys(("LG_AZB", "LG_EL", "LG_SIG", "LG_CONF", "LG_SNR"), 20),
+    }
+
+
+def test_nothing_here_imports_the_blocking_mavutil() -> None:
+    code = (
+        "import sys, locagen_edge.mavlink.component, locagen_edge.mavlink.link;"
+        "sys.exit('pymavlink.mavutil' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
