@@ -23,7 +23,7 @@ class Framer:
 
     def __init__(self, frame: int, hop: int, mics: int, rate_hz: float, origin_ns: int = 0) -> None:
         self.origin_ns = origin_ns
-        """monotonic time of the first sample since the last gap; may be set anew as it becomes better known"""
+        """monotonic time of the first sample since the last gap; set it anew as it becomes better known"""
         self._frame = frame
         self._hop = hop
         self._rate_hz = rate_hz
@@ -50,7 +50,7 @@ class Framer:
     def gap(self, overruns: int = 1) -> None:
         """Sound was lost here, `overruns` times: what has not filled a frame is dropped.
 
-        Sample numbers and time go on from the last sample pushed; set `origin_ns` where the lost time is known.
+        Sample numbers and time go on from the last sample pushed; set `origin_ns` where more is known.
         """
         self._start += self._held.shape[1]
         self._held = self._held[:, :0]

@@ -1,8 +1,8 @@
 """A stream at one rate from a stream at another: libsoxr, one state for all microphones.
 
-soxr works in long blocks, so what goes in comes out late (up to 0.11 s from 48 to 10 kHz), but not
-shifted: output sample k belongs to time k / rate_out, whatever the delay. So time needs no correction. All microphones
-share one filter and one phase, so no delay between them is made up.
+soxr works in long blocks, so what goes in comes out late (0.07 s from 48 kHz to 10 kHz, 0.11 s from 8 kHz)
+but not shifted: output sample k belongs to time k / rate_out whatever the delay, so time needs no correction.
+All microphones share one filter and one phase, so no delay between them is made up.
 
 A sample that is not finite spoils 65 ms of its own microphone (the length of the filter) and nothing else.
 """
@@ -16,11 +16,11 @@ from locagen_edge.types import F32
 
 
 class Resampler:
-    """Rows (n, mics) float32 at `rate_in` to rows at `rate_out`. However the rows are cut, the same comes out."""
+    """Rows (n, mics) float32 at `rate_in` to rows at `rate_out`; how they are cut does not show."""
 
     def __init__(self, rate_in: float, rate_out: float, mics: int) -> None:
-        # HQ: ripple and aliases below -100 dB, pass band up to 0.913 of the lower Nyquist frequency; VHQ doubles the
-        # delay for digits under the converter's noise.
+        # HQ errs below -120 dB and passes 0.94 of the lower Nyquist frequency; VHQ would double the delay for
+        # digits that lie under the converter's noise.
         self._soxr = (
             None if rate_in == rate_out else soxr.ResampleStream(rate_in, rate_out, mics, quality="HQ")
         )

@@ -21,8 +21,8 @@ SOURCES = {
 def open_source(settings: Settings) -> AsyncGenerator[Frame, None]:
     """Frames from `audio.source`, in real time. Close it with `aclose()`.
 
-    While it is read it raises `SourceError` when the source cannot be opened or fails: open it anew, a little later.
-    `SourceHungError`, a child of it, means that only a new process helps.
+    While it is read it raises `SourceError` when the source cannot be opened or fails: open it anew, a little
+    later. `SourceHungError`, a child of it, means that only a new process helps.
     """
     module, name = SOURCES[settings.audio.source]
     source: Callable[[Settings], AsyncGenerator[Frame, None]] = getattr(import_module(module), name)

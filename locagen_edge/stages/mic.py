@@ -30,7 +30,7 @@ from locagen_edge.errors import SourceError, SourceHungError
 from locagen_edge.framing import Framer, in_real_time
 from locagen_edge.resampling import Resampler
 from locagen_edge.settings import Settings
-from locagen_edge.types import F32, Array, Frame
+from locagen_edge.types import Array, Frame
 
 log = logging.getLogger(__name__)
 
@@ -71,8 +71,8 @@ def _check_rate(what: str, rate_hz: float, settings: Settings) -> None:
     top = settings.correlation.band_hz[1]
     if rate_hz < 2 * top:
         raise SourceError(
-            f"{what}: {rate_hz:g} Hz carries sound up to {rate_hz / 2:g} Hz, but correlation.band_hz goes to {top:g} Hz: "
-            "use a faster rate or lower the band"
+            f"{what}: {rate_hz:g} Hz carries sound up to {rate_hz / 2:g} Hz, but correlation.band_hz "
+            f"goes to {top:g} Hz: use a faster rate or lower the band"
         )
 
 
@@ -102,8 +102,8 @@ async def alsa(settings: Settings) -> AsyncGenerator[Frame, None]:
     """Frames from the device that `audio.device` names, until it fails or the reader closes.
 
     Raises `SourceError` when the device is missing, refuses the settings, goes away, or gives nothing for
-    `daemon.stall_s`; opening it anew is the way on. Raises `SourceHungError` when the driver does not return: only
-    a new process helps then.
+    `daemon.stall_s`; opening it anew is the way on. Raises `SourceHungError` when the driver does not return:
+    only a new process helps then.
     """
     global _hung
     if _hung is not None and _hung.is_alive():
@@ -126,20 +126,16 @@ async def alsa(settings: Settings) -> AsyncGenerator[Frame, None]:
             yield frame
     finally:
         stop.set()
-        if not await _ends(thread, CLOSE_S):
+        try:
+            async with asyncio.timeout(CLOSE_S):
+                await box.ended.wait()
+        except TimeoutError:
             _hung = thread
             log.error("%s: the driver does not let go", _label(settings))
 
 
 def _label(settings: Settings) -> str:
     return f'device "{settings.audio.device}"' if settings.audio.device else "the default device"
-
-
-async def _ends(thread: threading.Thread, limit_s: float) -> bool:
-    until = time.monotonic() + limit_s
-    while thread.is_alive() and time.monotonic() < until:
-        await asyncio.sleep(0.005)
-    return not thread.is_alive()
 
 
 class _Mailbox:
@@ -152,6 +148,8 @@ class _Mailbox:
         self._filled = asyncio.Event()
         self._frames: collections.deque[Frame] = collections.deque()
         self._failure: SourceError | None = None
+        self.ended = asyncio.Event()
+        """set when the thread is through with the device"""
 
     def put(self, frame: Frame) -> None:
         """From any thread."""
@@ -162,16 +160,17 @@ class _Mailbox:
                 # Frames dropped one after another are one loss, told by the first that gets through.
                 overruns = max(1, dropped.overruns + self._frames[0].overruns)
                 self._frames[0] = replace(self._frames[0], overruns=overruns)
-        self._wake()
+        self._set(self._filled)
 
-    def fail(self, error: SourceError) -> None:
-        """From any thread: `get` raises this when the frames before it are taken."""
+    def end(self, error: SourceError | None) -> None:
+        """From any thread, last: `get` raises the error when the frames before it are taken."""
         self._failure = error
-        self._wake()
+        self._set(self._filled)
+        self._set(self.ended)
 
-    def _wake(self) -> None:
+    def _set(self, event: asyncio.Event) -> None:
         with suppress(RuntimeError):  # the loop is closed: nobody reads any more
-            self._loop.call_soon_threadsafe(self._filled.set)
+            self._loop.call_soon_threadsafe(event.set)
 
     async def get(self) -> Frame:
         while True:
@@ -186,15 +185,17 @@ class _Mailbox:
 
 def _capture_into(box: _Mailbox, settings: Settings, stop: threading.Event) -> None:
     """The reading thread."""
+    failure = None
     try:
         with _opened(_portaudio(), settings) as stream:
             for frame in capture(stream, settings, stop.wait):
                 box.put(frame)
     except SourceError as error:
-        box.fail(error)
+        failure = error
     except Exception as error:  # a fault of ours must not end the thread in silence
         log.exception("capture failed")
-        box.fail(SourceError(f"{_label(settings)}: {error!r}"))
+        failure = SourceError(f"{_label(settings)}: {error!r}")
+    box.end(failure)
 
 
 class InputStream(Protocol):
@@ -257,7 +258,7 @@ class SampleClock:
         self._late_ns: collections.deque[int] = collections.deque(maxlen=LOSS_POLLS)
 
     def update(self, samples: int, now_ns: int) -> bool:
-        """`samples` had come by `now_ns`. False: count and clock have parted, so sound was lost in silence."""
+        """`samples` had come by `now_ns`. False: count and clock have parted: sound was lost in silence."""
         origin_ns = now_ns - round(samples * 1e9 / self._rate_hz)
         if self._polls == 0:
             self.origin_ns = origin_ns
@@ -341,8 +342,8 @@ def _opened(sd: ModuleType, settings: Settings) -> Iterator[InputStream]:
     except sd.PortAudioError as error:
         if _code(error) == INVALID_SAMPLE_RATE:
             message = (
-                f'audio.device_rate_hz: {audio.device_rate_hz} in settings, device "{device.name}" refuses it '
-                f"(its own is {device.default_rate_hz:g})"
+                f"audio.device_rate_hz: {audio.device_rate_hz} in settings, "
+                f'device "{device.name}" refuses it (its own is {device.default_rate_hz:g})'
             )
             raise SourceError(message) from error
         raise SourceError(f"{_label(settings)}: {_reason(error)}") from error
@@ -356,7 +357,7 @@ def _code(error: Exception) -> int:
 
 
 def _reason(error: Exception) -> str:
-    """PortAudio's words, or those of the driver below where it gives them: (text, code, (api, code, text))."""
+    """PortAudio's words, or the driver's below where it gives them: (text, code, (api, code, text))."""
     host = error.args[2] if len(error.args) > 2 else None
     return str(host[2] if host else error.args[0] if error.args else error)
 
@@ -430,8 +431,8 @@ def _opened_wav(path: Path | str, settings: Settings) -> Iterator[soundfile.Soun
         _check_rate(str(path), file.samplerate, settings)
         if max(audio.channel_map) >= file.channels:
             raise SourceError(
-                f"{path}: has {file.channels} channel{'s' * (file.channels > 1)}, but audio.channel_map names channel "
-                f"{max(audio.channel_map)} (counted from 0)"
+                f"{path}: has {file.channels} channel{'s' * (file.channels > 1)}, but audio.channel_map "
+                f"names channel {max(audio.channel_map)} (counted from 0)"
             )
         _tell_of_the_header(file, path)
         seconds = file.frames / file.samplerate
@@ -445,7 +446,7 @@ def _opened_wav(path: Path | str, settings: Settings) -> Iterator[soundfile.Soun
 
 
 def _tell_of_the_header(file: soundfile.SoundFile, path: Path | str) -> None:
-    """A recorder that lost power leaves a header that promises more than there is: what is there can be used."""
+    """A recorder that lost power leaves a header that promises more than there is: use what is there."""
     promised = re.search(r"^data : (\d+) \(should be (\d+)\)", file.extra_info, re.MULTILINE)
     if promised and int(promised[1]) > int(promised[2]):
         share = int(promised[2]) / int(promised[1])
