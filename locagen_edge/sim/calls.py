@@ -49,7 +49,8 @@ def _syllable(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -
     voiced = wave(wavetable((resonance + 0.01) / harmonics * 100.0, rng), turns_of(pitch, rate_hz))
     hiss = band_noise(n, rate_hz, 0.5 * top_hz, top_hz, rng)
     at = np.arange(n) / n
-    return voiced * np.sin(np.pi * at) ** 0.7 + 0.02 * hiss * np.exp(-8.0 * at)
+    sound: F64 = voiced * np.sin(np.pi * at) ** 0.7 + 0.02 * hiss * np.exp(-8.0 * at)
+    return sound
 
 
 def scream(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F64:
@@ -61,21 +62,21 @@ def scream(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F
     voiced = wave(wavetable(0.7 ** np.arange(count), rng), turns_of(pitch, rate_hz))
     flutter = glide(rng.uniform(50.0, 100.0, 4), n)
     rough = 1.0 + 0.6 * np.sin(2.0 * np.pi * turns_of(flutter, rate_hz))
-    return voiced * rough + 0.18 * np.sqrt(np.mean(voiced**2)) * band_noise(n, rate_hz, 300.0, top_hz, rng)
+    breath = 0.18 * np.sqrt(np.mean(voiced**2)) * band_noise(n, rate_hz, 300.0, top_hz, rng)
+    sound: F64 = voiced * rough + breath
+    return sound
 
 
 def whistle(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F64:
     """A referee's whistle: one tone near 3 kHz, which its pea shakes in pitch and loudness 30 times a second."""
     middle = min(rng.uniform(2800.0, 3200.0), 0.7 * top_hz)
     shake = np.sin(2.0 * np.pi * 30.0 * np.arange(n) / rate_hz)
-    tone_wave: F64 = np.sin(2.0 * np.pi * turns_of(middle * (1.0 + 0.03 * shake), rate_hz)) * (
-        1.0 + 0.5 * shake
-    )
-    return tone_wave
+    sound: F64 = np.sin(2.0 * np.pi * turns_of(middle * (1.0 + 0.03 * shake), rate_hz))
+    return sound * (1.0 + 0.5 * shake)
 
 
 def tone(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F64:
-    """1 kHz and nothing else: a direction from one frequency is the hardest case that still has one answer."""
+    """1 kHz and nothing else: the hardest case in which the delays still have one answer."""
     turns = min(1000.0, 0.5 * top_hz) * np.arange(n) / rate_hz + rng.uniform()
     sine: F64 = np.sin(2.0 * np.pi * turns)
     return sine

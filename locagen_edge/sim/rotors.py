@@ -1,8 +1,9 @@
 """Rotor noise: tones at the multiples of the blade rate, and broadband noise from the blades' wakes.
 
-The tones follow the throttle with a slow wander, each rotor its own, as an autopilot trims them against wind; they
-fall by 6 dB an octave. The broadband part falls by 3 dB an octave above 1 kHz and carries most above
-2 kHz. The mixture follows Sinibaldi & Marino, Applied Acoustics 74 (2013) 79-88, in shape, not in numbers.
+The tones follow the throttle with a slow wander, each rotor its own, as an autopilot trims them against
+wind; they fall by 6 dB an octave. The broadband part falls by 3 dB an octave above 1 kHz, so it carries most
+at high frequencies. The mixture follows what is measured on small propellers (Sinibaldi & Marino, Applied
+Acoustics 74 (2013) 79-88) in shape, not in numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ BLADES = 2
 IDLE_REV_S = 40.0  # revolutions per second without throttle, ...
 FULL_REV_S = 160.0  # ... and at full throttle: propellers of 10 inches
 TRIM = 0.03  # how far apart hovering rotors run
-WANDER = ((0.13, 0.008), (0.37, 0.005), (0.91, 0.003))  # Hz, relative swing of the blade rate
+WANDER = ((0.17, 0.010), (0.71, 0.005))  # Hz, relative swing of the blade rate
 BROADBAND_DB = -6.0  # against the tones, in the band
 LOW_HZ = 100.0
 PIECE = 8192  # samples of noise made at once
@@ -32,7 +33,7 @@ def blade_rate_hz(throttle: float) -> float:
 
 
 def hubs_m(rotors: int, arm_m: float) -> F64:
-    """(rotors, 3): hubs evenly around the origin in the plane of the array, none straight ahead (an X frame)."""
+    """(rotors, 3): hubs evenly around the origin in the array's plane, none straight ahead (an X frame)."""
     azimuth = np.pi / max(rotors, 1) * (2.0 * np.arange(rotors) + 1.0)
     return arm_m * np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(rotors)], axis=1)
 
@@ -55,7 +56,7 @@ class BladeRate:
 
 
 def rotor(throttle: float, rate_hz: float, top_hz: float, rng: np.random.Generator) -> Iterator[F64]:
-    """The endless sound of one rotor in pieces (any,), with in-band power 1 on average and nothing above `top_hz`."""
+    """The endless sound of one rotor in pieces (any,): in-band power 1 on average, nothing above `top_hz`."""
     blades = BladeRate(throttle, rng)
     amplitudes = _amplitudes(blades, rate_hz, top_hz)
     table = wavetable(amplitudes, rng)

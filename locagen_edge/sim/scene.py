@@ -1,11 +1,11 @@
 """The synthetic scene of the settings: a caller round a hovering drone, rotors, sensor noise.
 
-Everything is made in blocks of one fixed length and dealt out in the lengths asked for, each part with a random
-generator of its own: the same seed gives the same bytes however they are read, and a caller sounds
-the same whatever flies.
+Everything is made in blocks of one fixed length and dealt out in the lengths asked for, each part with a
+random generator of its own: the same seed gives the same bytes however they are read, and a caller sounds the
+same whatever flies.
 
-Delays follow the distance at the moment of hearing: exact for a drone that turns or moves past a person who stands,
-which is the case to be simulated, and which the microphones see as a caller on the move.
+Delays follow the distance at the moment of hearing: exact for a drone that turns or moves past a person who
+stands, which is the case to be simulated, and which the microphones see as a caller on the move.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from locagen_edge.framing import Framer, in_real_time
 from locagen_edge.geometry import angles
 from locagen_edge.settings import Settings
 from locagen_edge.sim.calls import CALLS
-from locagen_edge.sim.levels import BAND_HZ, band_power, from_db, in_band
-from locagen_edge.sim.propagation import REACH, interpolate, paths
+from locagen_edge.sim.levels import band_power, from_db, in_band
+from locagen_edge.sim.propagation import REACH, interpolate, interpolate_steadily, paths
 from locagen_edge.sim.rotors import hubs_m, rotor
 from locagen_edge.sim.synth import joined
 from locagen_edge.types import F32, F64, Array, Frame, Truth
@@ -132,6 +132,8 @@ class Scene:
         at = (time_s - delay_s) * (OVERSAMPLE * self._rate_hz)
         first = math.floor(at.min()) - REACH
         signal = tape.read(first, math.floor(at.max()) + REACH + 2)
+        if delay_s.shape[1] == 1:
+            return gain * interpolate_steadily(signal, at[:, 0] - first, OVERSAMPLE, len(time_s))
         return gain * interpolate(signal, at - first)
 
 
@@ -158,7 +160,7 @@ class Timeline:
 def voice(
     kind: str, timeline: Timeline, rate_hz: float, top_hz: float, rng: np.random.Generator
 ) -> Iterator[F64]:
-    """All that the caller utters from time 0, in pieces (any,): in-band power 1 during a call, else silence."""
+    """All that the caller utters from time 0, in pieces (any,): in-band power 1 in a call, else silence."""
     fade = round(FADE_S * rate_hz)
     longest = round(UTTERANCE_S * rate_hz)
     pieces = max(1, math.ceil((timeline.call - fade) / longest))
@@ -201,7 +203,7 @@ class Tape:
 
 
 def frames(settings: Settings) -> Generator[Frame, None, None]:
-    """Frames of the scene without an end, each with its truth, as fast as they are taken; time counts from 0."""
+    """Frames of the scene without an end, each with its truth, as fast as taken; time counts from 0."""
     audio = settings.audio
     scene = Scene(settings)
     framer = Framer(audio.frame, audio.hop, settings.mic_array.mics, audio.rate_hz)

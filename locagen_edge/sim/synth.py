@@ -27,7 +27,8 @@ def band_noise(
     spectrum = np.zeros(len(frequency), dtype=np.complex128)
     spectrum[inside] = gain * rng.standard_normal((len(inside), 2)).view(np.complex128)[:, 0]
     noise: F64 = np.fft.irfft(spectrum, size)[:n]
-    return noise * (size / (2.0 * np.sqrt(np.sum(gain**2))))
+    scale = size / (2.0 * float(np.sqrt(np.sum(gain**2))))
+    return scale * noise
 
 
 def wavetable(amplitudes: Array, rng: np.random.Generator) -> F64:
@@ -44,12 +45,13 @@ def wave(table: F64, turns: F64) -> F64:
     at = (turns - np.floor(turns)) * TABLE
     index = at.astype(np.intp)
     left = table[index]
-    return left + (at - index) * (table[index + 1] - left)
+    value: F64 = left + (at - index) * (table[index + 1] - left)
+    return value
 
 
-def turns_of(frequency_hz: F64, rate_hz: float, start: float = 0.0) -> F64:
+def turns_of(frequency_hz: F64, rate_hz: float) -> F64:
     """Phase in turns of an oscillator that runs at these instantaneous frequencies (n,)."""
-    return start + np.cumsum(frequency_hz) / rate_hz
+    return np.cumsum(frequency_hz) / rate_hz
 
 
 def glide(points: Array, n: int) -> F64:
@@ -58,14 +60,15 @@ def glide(points: Array, n: int) -> F64:
     step = np.minimum(at.astype(np.intp), len(points) - 2)
     ease = 0.5 - 0.5 * np.cos(np.pi * (at - step))
     points = np.asarray(points, dtype=np.float64)
-    return points[step] + ease * (points[step + 1] - points[step])
+    way: F64 = points[step] + ease * (points[step + 1] - points[step])
+    return way
 
 
 def joined(pieces: Iterable[F64], overlap: int) -> Iterator[F64]:
     """One sound from pieces, each cross-faded into the next over `overlap` samples at constant power.
 
-    Begins with a fade-in and, when the pieces end, ends with a fade-out; total length is that of the pieces less
-    `overlap` for each seam. Every piece is at least twice as long as the overlap.
+    Begins with a fade-in and, when the pieces end, ends with a fade-out; total length is that of the pieces
+    less `overlap` for each seam. Every piece is at least twice as long as the overlap.
     """
     rise = np.sin(0.5 * np.pi * (np.arange(overlap) + 0.5) / overlap)
     tail = np.zeros(overlap)
