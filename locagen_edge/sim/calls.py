@@ -41,7 +41,7 @@ def speech(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F
 
 
 def _syllable(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F64:
-    pitch = glide(rng.uniform(180.0, 300.0, 3), n)
+    pitch = glide(rng.uniform(220.0, 380.0, 3), n)
     harmonics = pitch.mean() * np.arange(1, max(2, int(top_hz / pitch.max()) + 1))
     formants = np.array(VOWELS[rng.integers(len(VOWELS))])[:, np.newaxis]
     resonance = np.sum(1.0 / (1.0 + ((harmonics - formants) / FORMANT_WIDTH_HZ) ** 2), axis=0)
@@ -49,7 +49,7 @@ def _syllable(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -
     voiced = wave(wavetable((resonance + 0.01) / harmonics * 100.0, rng), turns_of(pitch, rate_hz))
     hiss = band_noise(n, rate_hz, 0.5 * top_hz, top_hz, rng)
     at = np.arange(n) / n
-    sound: F64 = voiced * np.sin(np.pi * at) ** 0.7 + 0.02 * hiss * np.exp(-8.0 * at)
+    sound: F64 = voiced * np.sin(np.pi * at) ** 0.7 + 1.0 * hiss * at * np.exp(-12.0 * at)
     return sound
 
 
@@ -68,11 +68,12 @@ def scream(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F
 
 
 def whistle(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F64:
-    """A referee's whistle: one tone near 3 kHz, which its pea shakes in pitch and loudness 30 times a second."""
+    """A referee's whistle: a tone at 3 kHz that its pea shakes in pitch and loudness 30 times a second."""
     middle = min(rng.uniform(2800.0, 3200.0), 0.7 * top_hz)
     shake = np.sin(2.0 * np.pi * 30.0 * np.arange(n) / rate_hz)
     sound: F64 = np.sin(2.0 * np.pi * turns_of(middle * (1.0 + 0.03 * shake), rate_hz))
-    return sound * (1.0 + 0.5 * shake)
+    sound *= 1.0 + 0.5 * shake
+    return sound
 
 
 def tone(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F64:

@@ -10,15 +10,18 @@ Two ways, because two things are wanted:
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 
 from locagen_edge.types import F32, F64, Array
 
 TAPS = 16
-PHASES = 16384  # delays fall on a grid of 1/16384 sample: 3 ns at 20 kHz, and -86 dB of error at 4.7 kHz
-# Kaiser's formula for a transition from 0.5 to 1.5 of the signal's half Nyquist frequency: the error stays below
-# -90 dB up to half of the Nyquist frequency, so a signal is held at twice the rate at which it is heard.
+REACH = TAPS // 2
+"""samples that `interpolate` needs on either side"""
+PHASES = 16384  # delays fall on a grid of 1/16384 sample: 3 ns at 20 kHz
+# Kaiser's window for 90 dB over 16 taps has its transition from half of the Nyquist frequency to one and a
+# half of it: a signal that keeps below half, being held at twice the rate at which it is heard, passes whole.
 BETA = 9.0
 
 
@@ -61,6 +64,7 @@ def plane_wave(signal: Array, rate_hz: float, positions_m: F64, u: F64, speed_m_
     return delayed(signal, -(positions_m @ u) / speed_m_s * rate_hz)
 
 
+@cache
 def _kernels() -> F32:
     """(PHASES + 1, TAPS): row p reads the signal p / PHASES after the tap number TAPS / 2 - 1."""
     fraction = np.arange(PHASES + 1)[:, np.newaxis] / PHASES
@@ -69,20 +73,15 @@ def _kernels() -> F32:
     return (np.sinc(at) * window).astype(np.float32)
 
 
-KERNELS = _kernels()
-REACH = TAPS // 2
-"""samples that `interpolate` needs on either side"""
-
-
 def interpolate(signal: F32, at: F64) -> F32:
     """The signal (n,) at the fractional sample numbers `at`, each from REACH - 1 to n - 1 - REACH.
 
-    Right to -80 dB where the signal keeps below half of its Nyquist frequency.
+    The error is below -80 dB where the signal keeps below half of its Nyquist frequency.
     """
     index = np.floor(at).astype(np.intp)
     phase = np.rint((at - index) * PHASES).astype(np.intp)
     windows = np.lib.stride_tricks.sliding_window_view(signal, TAPS)
-    read: F32 = np.einsum("...t,...t->...", windows[index - (REACH - 1)], KERNELS[phase])
+    read: F32 = np.einsum("...t,...t->...", windows[index - (REACH - 1)], _kernels()[phase])
     return read
 
 
@@ -92,5 +91,5 @@ def interpolate_steadily(signal: F32, first: F64, step: int, n: int) -> F32:
     phase = np.rint((first - index) * PHASES).astype(np.intp)
     windows = np.lib.stride_tricks.sliding_window_view(signal, TAPS)
     starts = index - (REACH - 1)
-    read = [windows[s : s + step * n : step] @ KERNELS[p] for s, p in zip(starts, phase, strict=True)]
+    read = [windows[s : s + step * n : step] @ _kernels()[p] for s, p in zip(starts, phase, strict=True)]
     return np.stack(read)
