@@ -17,6 +17,10 @@ class SourceError(LocagenError):
     """A sound source that cannot be opened or has failed: a device, a file, a driver."""
 
 
+class SourceHungError(SourceError):
+    """A driver that does not return. Its thread cannot be ended from within: only a new process helps."""
+
+
 class ModelError(LocagenError):
     """A model file that is missing, altered, or not of the shape the settings ask for."""
 

@@ -1,0 +1,76 @@
+"""Overlapping frames out of blocks of any length, and frames in step with the clock.
+
+Every source delivers its sound in blocks of its own size; the pipeline wants `frame` samples every `hop`.
+Two laws: how the sound was cut into blocks never shows in the frames, and no frame ever holds sound from
+both sides of a gap, because correlations across a splice are worth nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncGenerator, Generator
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+
+from locagen_edge.types import F32, Frame
+
+
+class Framer:
+    """Cuts a stream into frames. Time is counted in samples from `origin_ns`."""
+
+    def __init__(self, frame: int, hop: int, mics: int, rate_hz: float, origin_ns: int = 0) -> None:
+        self.origin_ns = origin_ns
+        """monotonic time of the first sample since the last gap; set it anew as it becomes better known"""
+        self._frame = frame
+        self._hop = hop
+        self._rate_hz = rate_hz
+        self._held: F32 = np.empty((mics, 0), dtype=np.float32)
+        self._start = 0  # number of the first sample held
+        self._origin = 0  # number of the first sample since the last gap
+        self._overruns = 0
+
+    def push(self, block: F32) -> list[Frame]:
+        """The frames that (mics, n) more samples complete, in order. They own their samples."""
+        held = np.concatenate([self._held, block], axis=1, dtype=np.float32)
+        frames = []
+        at = 0
+        while held.shape[1] - at >= self._frame:
+            start = self._start + at
+            samples = held[:, at : at + self._frame].copy()
+            frames.append(Frame(samples, self._rate_hz, self._time_ns(start), start, self._overruns))
+            self._overruns = 0
+            at += self._hop
+        self._held = held[:, at:].copy()  # a view would keep the whole of a long block alive
+        self._start += at
+        return frames
+
+    def gap(self, overruns: int = 1) -> None:
+        """Sound was lost here, `overruns` times: what has not filled a frame is dropped.
+
+        Sample numbers and time go on from the last sample pushed; set `origin_ns` where more is known.
+        """
+        self._start += self._held.shape[1]
+        self._held = self._held[:, :0]
+        self.origin_ns = self._time_ns(self._start)
+        self._origin = self._start
+        self._overruns += overruns
+
+    def _time_ns(self, sample: int) -> int:
+        return self.origin_ns + round((sample - self._origin) * 1e9 / self._rate_hz)
+
+
+async def in_real_time(frames: Generator[Frame, None, None]) -> AsyncGenerator[Frame, None]:
+    """The same frames, each when its last sample would have been heard, stamped with monotonic time.
+
+    Where the reader is late, frames come as fast as they are taken until it has caught up: none is dropped.
+    """
+    origin_ns = time.monotonic_ns()
+    with closing(frames):
+        for frame in frames:
+            t_ns = origin_ns + frame.t_ns
+            end_ns = t_ns + round(frame.samples.shape[1] * 1e9 / frame.rate_hz)
+            await asyncio.sleep(max(0.0, (end_ns - time.monotonic_ns()) * 1e-9))
+            yield replace(frame, t_ns=t_ns)
