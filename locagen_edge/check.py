@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from locagen_edge.errors import LocagenError
 from locagen_edge.mavlink.component import Component
-from locagen_edge.mavlink.link import Link
+from locagen_edge.mavlink.link import Link, parse
 from locagen_edge.models import default_directory, load_model, read_manifest
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings
@@ -62,7 +62,7 @@ async def _listen(settings: Settings, pipeline: Pipeline, seconds: float) -> lis
     last: Estimate | None = None
     end = time.monotonic() + seconds
     try:
-        async with contextlib.aclosing(open_source(settings)) as source:  # type: ignore[type-var]
+        async with contextlib.aclosing(open_source(settings)) as source:
             async with asyncio.timeout(seconds + settings.daemon.stall_s):
                 async for frame in source:
                     last = pipeline.process(frame)
@@ -87,7 +87,7 @@ async def _link(settings: Settings, seconds: float) -> Finding:
     """Opens the link and waits for an autopilot's heartbeat."""
     component = Component(settings.mavlink)
     link = Link(
-        settings.mavlink.link,
+        parse(settings.mavlink.link),
         backoff_s=settings.daemon.backoff_s,
         on_bytes=lambda data: component.receive(data, time.monotonic()),
     )

@@ -17,13 +17,16 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from locagen_edge import __version__
 from locagen_edge.errors import LocagenError, SettingsError
 from locagen_edge.geometry import compass_deg
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
 from locagen_edge.types import Estimate
+
+if TYPE_CHECKING:
+    from locagen_edge.daemon import Daemon
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -170,43 +173,45 @@ class LiveLine:
         self._second = 0
         self._sent: Counter[str] = Counter()
 
-    def __call__(self, daemon: Any) -> None:
+    def __call__(self, daemon: Daemon) -> None:
         self._second += 1
         sent = Counter(daemon.component.sent)
         news, self._sent = sent - self._sent, sent
-        link = "up" if daemon.link.up else "down"
-        if not daemon.hearing or daemon.estimate is None:
-            print(
-                f"{self._second:5d} s  no sound: {daemon.source_fault or 'waiting'}  link {link}", flush=True
-            )
-            return
         latency = daemon.counters.latency_s
-        delay = f"  {1e3 * statistics.median(latency):.1f} ms" if latency else ""
-        print(
-            f"{self._second:5d} s  {describe(daemon.estimate)}{delay}  link {link}, sent {_counts(news)}",
-            flush=True,
-        )
+        parts = [f"{self._second:4d} s"]
+        if not daemon.hearing or daemon.estimate is None:
+            parts.append(f"no sound: {daemon.source_fault or 'waiting'}")
+        else:
+            parts.append(describe(daemon.estimate))
+            if latency:
+                parts.append(f"{1e3 * statistics.median(latency):.1f} ms")
+        parts.append(f"sent {_counts(news)}" if daemon.link.up else f"link down: {daemon.link.last_error}")
+        print("  ".join(parts), flush=True)
 
 
 def describe(estimate: Estimate) -> str:
     """One frame's estimate in words: the track's bearing, and the truth beside it where it is known."""
     track, truth = estimate.track, estimate.truth
-    parts = [f"{'CALL ' if estimate.detection.call else 'quiet'} snr {estimate.detection.snr_db:5.1f} dB"]
     if track is None:
-        parts.append("bearing  --- ")
+        parts = ["bearing  ---         "]
     else:
         azimuth, sigma = compass_deg(track.azimuth_rad), math.degrees(track.azimuth_sigma_rad)
-        parts.append(f"bearing {azimuth:5.1f}° ±{sigma:.1f}°")
-        if track.elevation_rad is not None:
-            parts.append(f"elevation {math.degrees(track.elevation_rad):.0f}°")
+        parts = [f"bearing {azimuth:5.1f}° ±{sigma:4.1f}°"]
     if truth is not None:
         parts.append(f"true {compass_deg(truth.azimuth_rad):5.1f}°")
+    if track is not None and track.elevation_rad is not None:
+        parts.append(f"elevation {math.degrees(track.elevation_rad):3.0f}°")
+    parts.append(f"snr {estimate.detection.snr_db:5.1f} dB {'CALL' if estimate.detection.call else '    '}")
     parts += [f"! {fault}" for fault in estimate.faults]
     return "  ".join(parts)
 
 
-def _counts(counter: Counter[str]) -> str:
-    return ", ".join(f"{n} {name}" for name, n in sorted(counter.items())) or "nothing"
+def _counts(sent: Counter[str]) -> str:
+    """The values of one bearing are messages of one kind, each with its own name: counted as that."""
+    kinds: Counter[str] = Counter()
+    for name, number in sent.items():
+        kinds["NAMED_VALUE_FLOAT" if name.startswith("LG_") else name] += number
+    return ", ".join(f"{number} {name}" for name, number in sorted(kinds.items())) or "nothing"
 
 
 # --- replay -------------------------------------------------------------------------------------------
@@ -270,7 +275,7 @@ def replay(path: Path, settings: Settings) -> Iterator[dict[str, Any]]:
     pipeline = Pipeline(settings)
     rate_hz, frame_s = settings.audio.rate_hz, settings.audio.frame / settings.audio.rate_hz
     bar = tqdm(
-        total=round(wav_duration_s(path), 1),
+        total=round(wav_duration_s(path, settings), 1),
         unit="s",
         desc=path.name,
         disable=not sys.stderr.isatty() or sys.stdout.isatty(),

@@ -13,13 +13,13 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from locagen_edge.errors import SourceError
+from locagen_edge.errors import SourceError, SourceHungError
 from locagen_edge.mavlink.component import Component, Status
-from locagen_edge.mavlink.link import Link
+from locagen_edge.mavlink.link import Link, parse
 from locagen_edge.notify import notify
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings
@@ -62,7 +62,7 @@ class Daemon:
         settings: Settings,
         *,
         on_second: Callable[[Daemon], None] | None = None,
-        sources: Callable[[Settings], AsyncIterator[Frame]] = open_source,
+        sources: Callable[[Settings], AsyncGenerator[Frame, None]] = open_source,
     ):
         self.settings = settings
         self.counters = Counters()
@@ -75,12 +75,13 @@ class Daemon:
         self._heard_s = -float("inf")
         self._tasks: list[asyncio.Task[None]] = []
         self._ready = False
+        self._link_was_up = False
 
     async def startup(self) -> None:
         """Makes pipeline and link. Raises `LocagenError` where the settings cannot be flown with."""
         self.component = Component(self.settings.mavlink)
         self.link = Link(
-            self.settings.mavlink.link,
+            parse(self.settings.mavlink.link),
             backoff_s=self.settings.daemon.backoff_s,
             on_bytes=lambda data: self.component.receive(data, time.monotonic()),
         )
@@ -129,9 +130,9 @@ class Daemon:
             heard = self.counters.frames
             try:
                 await self._read_source()
+            except SourceHungError:
+                raise
             except SourceError as error:
-                if error.fatal:
-                    raise
                 self.counters.source_failures += 1
                 if str(error) != self.source_fault:
                     log.error("%s", error)
@@ -146,16 +147,8 @@ class Daemon:
 
     async def _read_source(self) -> None:
         """Frames into the queue until the source ends. Raises `SourceError` where it fails or stalls."""
-        async with contextlib.aclosing(self._sources(self.settings)) as source:  # type: ignore[type-var]
-            while True:
-                try:
-                    async with asyncio.timeout(self.settings.daemon.stall_s):
-                        frame = await anext(source)
-                except TimeoutError:
-                    stall_s = self.settings.daemon.stall_s
-                    raise SourceError(f"no sound for {stall_s:g} s: the source has stalled") from None
-                except StopAsyncIteration:
-                    return
+        async with contextlib.aclosing(self._sources(self.settings)) as source:
+            async for frame in source:
                 self._heard_s = time.monotonic()
                 self.counters.frames += 1
                 self.counters.overruns += frame.overruns
@@ -186,15 +179,24 @@ class Daemon:
         return time.monotonic() - self._heard_s < self.settings.daemon.stall_s
 
     def _send(self) -> None:
-        estimate = self.estimate
-        status = Status(
-            hearing=self.hearing,
-            track=estimate.track if estimate and self.hearing else None,
-            snr_db=estimate.detection.snr_db if estimate else 0.0,
-            faults=estimate.faults if estimate and self.hearing else (),
-        )
-        for message in self.component.due(time.monotonic(), status):
+        """Sends what is due. While the link is down nothing is: it would be said to nobody."""
+        if not self.link.up:
+            self._link_was_up = False
+            return
+        if not self._link_was_up:
+            self._link_was_up = True
+            self.component.say_again()
+        for message in self.component.due(time.monotonic(), self._status()):
             self.link.send(message)
+
+    def _status(self) -> Status:
+        if not self.hearing:
+            faults = (f"no sound: {self.source_fault}",) if self.source_fault else ()
+            return Status(hearing=False, track=None, snr_db=0.0, faults=faults)
+        estimate = self.estimate
+        if estimate is None:
+            return Status(hearing=True, track=None, snr_db=0.0, faults=())
+        return Status(True, estimate.track, estimate.detection.snr_db, estimate.faults)
 
     async def _tick(self) -> None:
         """What is due without a new estimate; once a second the status and the watchdog."""
