@@ -1,0 +1,1 @@
+"""Simulated sound and simulated delays, with the truth beside them."""
