@@ -1,0 +1,145 @@
+"""The workshop's settings: those of the flight, the twin, and the hyper-parameters of every model.
+
+One file holds them all, so a model is trained for the array, the air and the rate that will fly. The sample
+file is `python -m locagen_edge.lab.settings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from locagen_edge.errors import SettingsError
+from locagen_edge.geometry import MicArray, equilateral
+from locagen_edge.settings import Settings, sample, setting
+from locagen_edge.sim.arrivals import TwinSettings
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """How much data the models are trained and tested on, drawn from the twin."""
+
+    samples: int = setting(24000, "Samples; the paper's number.", unit="samples", least=100, most=100_000_000)
+    train_share: float = setting(0.8, "Share to train on; the rest tests.", least=0.1, most=0.95)
+    validation_share: float = setting(
+        0.1,
+        "Share of the training samples that decides when a network stops, and is not trained on.",
+        least=0.01, most=0.5,
+    )  # fmt: skip
+    seed: int = setting(1, "Same seed, same data.", least=0, most=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class ForestSettings:
+    """Random forests: classifiers of azimuth bins, and the regression of cosine and sine."""
+
+    trees: int = setting(100, "Trees.", least=1, most=10000)
+    leaf: int = setting(
+        20,
+        "Fewest samples in a leaf. A cell of whole-sample delays is one point for a tree, so a small leaf "
+        "costs nothing there; without rounding it is what smooths.",
+        unit="samples", least=1, most=10000,
+    )  # fmt: skip
+    depth: int = setting(24, "Deepest tree.", unit="levels", least=1, most=64)
+    seed: int = setting(1, "Of bootstraps and splits.", least=0, most=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class MlpSettings:
+    """Multilayer perceptron from the features to the azimuth's cosine and sine."""
+
+    width: int = setting(64, "Neurons in each hidden layer.", least=1, most=4096)
+    layers: int = setting(2, "Hidden layers.", least=1, most=16)
+    rate: float = setting(5e-3, "Highest learning rate of AdamW.", least=1e-7, most=1)
+    batch: int = setting(256, "Samples in a step.", unit="samples", least=1, most=1_000_000)
+    epochs: int = setting(60, "Passes over the data at most.", least=1, most=10000)
+    patience: int = setting(
+        15, "Passes without a better validation error before it stops.", unit="passes", least=1, most=10000
+    )
+    seed: int = setting(1, "Of weights and order.", least=0, most=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class SirenSettings:
+    """SIREN: a perceptron whose activation is a sine (Sitzmann et al., NeurIPS 2020)."""
+
+    width: int = setting(64, "Neurons in each hidden layer.", least=1, most=4096)
+    layers: int = setting(2, "Hidden layers.", least=1, most=16)
+    omega: float = setting(
+        1.0,
+        "Factor inside the first sine, for standardised inputs. The article's 30 is for the pixels of an "
+        "image, whose detail is a thousandth of the input's range; bearings have none that fine.",
+        least=0.01, most=10000,
+    )  # fmt: skip
+    omega_hidden: float = setting(
+        1.0, "Factor inside the other sines; the weights start smaller by it.", least=0.01, most=10000
+    )
+    rate: float = setting(2e-3, "Highest learning rate of AdamW.", least=1e-7, most=1)
+    batch: int = setting(256, "Samples in a step.", unit="samples", least=1, most=1_000_000)
+    epochs: int = setting(60, "Passes over the data at most.", least=1, most=10000)
+    patience: int = setting(
+        15, "Passes without a better validation error before it stops.", unit="passes", least=1, most=10000
+    )
+    seed: int = setting(1, "Of weights and order.", least=0, most=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class LabSettings(Settings):
+    """All settings of the flight and of the workshop. Every section and every key may be left out."""
+
+    twin: TwinSettings = TwinSettings()  # noqa: RUF009 - frozen
+    data: DataSettings = DataSettings()
+    forest: ForestSettings = ForestSettings()
+    mlp: MlpSettings = MlpSettings()
+    siren: SirenSettings = SirenSettings()
+
+    def __post_init__(self) -> None:
+        faults: list[str] = []
+        try:
+            super().__post_init__()
+        except SettingsError as error:
+            faults += str(error).splitlines()
+        faults += _faults_of_twin(self)
+        if faults:
+            raise SettingsError("\n".join(faults))
+
+
+def _faults_of_twin(s: LabSettings) -> Iterator[str]:
+    mics = len(s.array.positions_m)
+    flat = [row[:2] for row in s.array.positions_m if len(row) == 3]
+    if mics < 3:
+        yield f"array.positions_m: {mics} microphones, but a full azimuth needs three that are not in line"
+    elif len(flat) == mics and np.isfinite(flat).all():
+        across = np.linalg.matrix_rank(np.array(flat) - flat[0], tol=1e-3)
+        if across < 2 and s.bearing.estimator not in ("far-field", "hyperbolic"):  # the others say so above
+            yield "array.positions_m: the microphones are in line, and a full azimuth needs a plane"
+    if len(s.twin.offset_samples) != mics:
+        yield (
+            f"twin.offset_samples: {len(s.twin.offset_samples)} offsets, "
+            f"but array.positions_m has {mics} microphones"
+        )
+    largest = 0.5 * _smallest_spacing(s)
+    if 0.0 < largest <= s.twin.position_error_m:
+        yield (
+            f"twin.position_error_m: {s.twin.position_error_m:g} m could put two microphones, "
+            f"{2 * largest:.3g} m apart, at the same place"
+        )
+
+
+def _smallest_spacing(s: LabSettings) -> float:
+    """Metres; 0 where the positions are not such that it can be told."""
+    positions = s.array.positions_m
+    if len(positions) < 2 or any(len(row) != 3 for row in positions) or not np.isfinite(positions).all():
+        return 0.0
+    return float(MicArray(np.array(positions)).spacing_m.min())
+
+
+def triangle(spacing_m: float) -> tuple[tuple[float, ...], ...]:
+    """`array.positions_m` of an equilateral triangle of this side."""
+    return tuple(tuple(float(x) for x in row) for row in equilateral(spacing_m).positions_m)
+
+
+if __name__ == "__main__":
+    print(sample(LabSettings()), end="")
