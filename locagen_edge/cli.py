@@ -286,6 +286,7 @@ def replay(path: Path, settings: Settings) -> Iterator[dict[str, Any]]:
             t_s = frame.start / rate_hz
             bar.update(t_s + frame_s - bar.n)
             yield record(pipeline.process(frame), t_s)
+        bar.update(bar.total - bar.n)  # what is left is shorter than a hop
 
 
 def _width(name: str) -> int:
