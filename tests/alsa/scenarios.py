@@ -141,7 +141,7 @@ async def hung(settings, control):
         yield from ()
 
     mic.capture, real = capture, mic.capture
-    mic.OPEN_S = 0.3
+    mic.OPEN_S = 0.1  # and stall_s of 0.3 s
     mic.CLOSE_S = 0.2
     errors = []
     for _ in range(2):
