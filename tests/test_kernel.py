@@ -235,7 +235,7 @@ def test_power_of_a_sine_is_a_half(frame: int, frequency_hz: float) -> None:
     samples[2] = np.sin(2 * np.pi * frequency_hz / 10_000.0 * np.arange(frame))
     samples[3] = 0.25 * samples[2]
     _, power, _ = kernel(4, frame).process(samples)
-    # What Hann's side lobes carry out of the band, and what a part of a period does to the mean of its square.
+    # Hann's side lobes reach out of the band, and a part of a period weighs on the mean of the square.
     np.testing.assert_allclose(power, [0.0, 0.0, 0.5, 0.5 / 16], rtol=1e-3)
 
 
