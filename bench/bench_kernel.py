@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +148,7 @@ def peers(
         raise SystemExit(f"the kernel refuses {case}: {code}")
     add("kernel, C", library.bench_kernel)
     kernel = GccPhat(**asdict(case))
-    add("kernel, Python", lambda calls: mean_time(lambda: kernel.process(samples), calls))
+    add("kernel, Python", lambda calls: mean_time(partial(kernel.process, samples), calls))
     if with_fftw and library.bench_fftw_init(case.mics, case.frame, pointer) == 0:
         add("FFTW, bare transforms", library.bench_fftw)
     else:
@@ -155,7 +156,7 @@ def peers(
     plain = numpy_gcc_phat(case)
     # The same question has the same answer, or there is nothing to compare.
     np.testing.assert_allclose(plain(samples), kernel.process(samples)[0], atol=1e-3)
-    add("numpy", lambda calls: mean_time(lambda: plain(samples), calls))
+    add("numpy", lambda calls: mean_time(partial(plain, samples), calls))
     tdoa = pyroomacoustics_tdoa()
     if tdoa is None:
         missing.append("pyroomacoustics: not installed")

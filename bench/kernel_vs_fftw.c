@@ -53,24 +53,26 @@ double bench_kernel(int calls)
 static fftwf_plan plans[MOST_MICS + MOST_PAIRS];
 static int plan_count;
 
-/* Every transform has its own arrays, as in a real pipeline. Returns 0, or -1 without memory. */
+/* Samples, bins and correlations of each microphone or pair are three arrays; where there are more pairs than
+ * microphones they take turns with the arrays. Returns 0, or -1 without memory. */
 int bench_fftw_init(int mics, int frame, const float *in)
 {
-    int pairs = mics * (mics - 1) / 2;
+    float *time[MOST_MICS], *lags[MOST_MICS];
+    fftwf_complex *bins[MOST_MICS];
     while (plan_count > 0)
         fftwf_destroy_plan(plans[--plan_count]);
-    for (int n = 0; n < mics + pairs; n++) {
-        float *time = fftwf_alloc_real((size_t)frame);
-        fftwf_complex *bins = fftwf_alloc_complex((size_t)frame / 2 + 1);
-        if (time == NULL || bins == NULL)
+    for (int m = 0; m < mics; m++) {
+        time[m] = fftwf_alloc_real((size_t)frame);
+        lags[m] = fftwf_alloc_real((size_t)frame);
+        bins[m] = fftwf_alloc_complex((size_t)frame / 2 + 1);
+        if (time[m] == NULL || lags[m] == NULL || bins[m] == NULL)
             return -1;
-        plans[plan_count++] = n < mics ? fftwf_plan_dft_r2c_1d(frame, time, bins, FFTW_MEASURE)
-                                       : fftwf_plan_dft_c2r_1d(frame, bins, time, FFTW_MEASURE);
-        for (int k = 0; k < frame; k++) /* after planning, which overwrites */
-            time[k] = in[(n < mics ? n : 0) * frame + k];
-        for (int k = 0; k <= frame / 2; k++)
-            bins[k][0] = bins[k][1] = in[k];
+        plans[plan_count++] = fftwf_plan_dft_r2c_1d(frame, time[m], bins[m], FFTW_MEASURE);
+        for (int n = 0; n < frame; n++) /* after planning, which overwrites */
+            time[m][n] = in[m * frame + n];
     }
+    for (int pair = 0; pair < mics * (mics - 1) / 2; pair++)
+        plans[plan_count++] = fftwf_plan_dft_c2r_1d(frame, bins[pair % mics], lags[pair % mics], FFTW_MEASURE);
     return 0;
 }
 
