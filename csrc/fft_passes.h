@@ -171,7 +171,10 @@ STEP void part(const locagen_fft *fft, long low, long high, spectrum from, spect
 
 STEP void middle8(long length, long stride, const float *twiddles, spectrum from, spectrum to)
 {
-    pass(8, length, stride, twiddles, from, to);
+    if (stride == 8)
+        pass(8, length, 8, twiddles, from, to);
+    else
+        pass(8, length, stride, twiddles, from, to);
 }
 
 STEP void middle4(long length, long stride, const float *twiddles, spectrum from, spectrum to)
