@@ -94,6 +94,8 @@ install: ## as root: program, unit, user and sample settings; DESTDIR is honoure
 	install -d $(DESTDIR)$(LIB_DIR) $(DESTDIR)$(ETC_DIR) $(DESTDIR)$(SYSTEMD_DIR) $(DESTDIR)$(SYSUSERS_DIR)
 	$(PYTHON) -m venv $(DESTDIR)$(LIB_DIR)
 	$(DESTDIR)$(LIB_DIR)/bin/pip install -q .
+	@# scripts name their interpreter: the place where it will be, not where it is packed
+	@test -z "$(DESTDIR)" || grep -rlI '^#!$(DESTDIR)' $(DESTDIR)$(LIB_DIR)/bin | xargs -r sed -i '1s|^#!$(DESTDIR)|#!|'
 	install -m 644 systemd/locagen-edge.service $(DESTDIR)$(SYSTEMD_DIR)/
 	install -m 644 systemd/locagen-edge.sysusers $(DESTDIR)$(SYSUSERS_DIR)/locagen-edge.conf
 	test -e $(DESTDIR)$(ETC_DIR)/locagen-edge.toml || install -m 644 systemd/locagen-edge.toml $(DESTDIR)$(ETC_DIR)/

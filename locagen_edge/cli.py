@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from locagen_edge import __version__
-from locagen_edge.errors import LocagenError, SettingsError
+from locagen_edge.errors import LocagenError, SettingsError, SourceHungError
 from locagen_edge.geometry import compass_deg
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
 from locagen_edge.types import Estimate
@@ -40,6 +40,9 @@ def main(argv: list[str] | None = None) -> None:
         for line in str(error).splitlines():
             print(f"locagen-edge: {line}", file=sys.stderr)
         code = 1
+    except SourceHungError as error:
+        print(f"locagen-edge: {error}", file=sys.stderr, flush=True)
+        os._exit(1)  # an orderly exit would call into the driver that hangs
     except LocagenError as error:
         print(f"locagen-edge: {error}", file=sys.stderr)
         code = 1
