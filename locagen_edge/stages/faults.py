@@ -63,7 +63,12 @@ def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearin
         for j in live[k + 1 :]:
             if np.abs(samples[i] - samples[j]).max() <= SAME * magnitude[i].max():
                 found.add(f"microphones {i} and {j}: the same signal twice, check audio.channel_map")
-    if not dead and not broken and np.sort(tdoa.peak)[len(tdoa.peak) // 2] > STRONG_PEAK and bearing.misfit > MISFIT:
+    if (
+        not dead
+        and not broken
+        and np.sort(tdoa.peak)[len(tdoa.peak) // 2] > STRONG_PEAK
+        and bearing.misfit > MISFIT
+    ):
         found.add("the delays fit no direction: channels swapped, or array.positions_m is wrong")
     return found
 
