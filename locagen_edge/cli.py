@@ -203,7 +203,7 @@ def describe(estimate: Estimate) -> str:
     if truth is not None:
         parts.append(f"true {compass_deg(truth.azimuth_rad):5.1f}°")
     if track is not None and track.elevation_rad is not None:
-        parts.append(f"elevation {math.degrees(track.elevation_rad):3.0f}°")
+        parts.append(f"el {math.degrees(track.elevation_rad):3.0f}°")
     parts.append(f"snr {estimate.detection.snr_db:5.1f} dB {'CALL' if estimate.detection.call else '    '}")
     parts += [f"! {fault}" for fault in estimate.faults]
     return "  ".join(parts)
