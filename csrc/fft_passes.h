@@ -24,8 +24,8 @@ INLINE void dft4(vec re[4], vec im[4])
     re[3] = dr - ei, im[3] = di + er;
 }
 
-/* The even outputs of radix 8, 0 2 4 6, in a[0..3]. Odd and even ones are made one after the other, each from the
- * eight inputs: sixteen registers hold one half, not both. */
+/* The even outputs of radix 8, 0 2 4 6, in a[0..3]. Odd and even ones are made one after the other, each
+ * from the eight inputs: sixteen registers hold one half, not both. */
 INLINE void dft8_even(const vec re[8], const vec im[8], vec ar[4], vec ai[4])
 {
     for (int j = 0; j < 4; j++)
@@ -57,8 +57,9 @@ INLINE void times(vec *re, vec *im, vec wr, vec wi)
     *re = r;
 }
 
-/* WIDTH samples of four rows, times the window, as two vectors of complex points: with samples s, s + 1 ..
- * the first holds (s, s + 1) and, eight lanes wide, (s + 4, s + 5); the second (s + 2, s + 3), (s + 6, s + 7). */
+/* WIDTH samples of four rows, times the window, as two vectors of complex points: from sample s on, the
+ * first holds the point (s, s + 1), the second (s + 2, s + 3); eight wide, (s + 4, s + 5) and (s + 6, s + 7)
+ * follow in the upper halves. */
 INLINE void fetch(const float *const rows[4], const float *window, long s, vec re[2], vec im[2])
 {
     vec w = load(window + s);
@@ -72,7 +73,7 @@ INLINE void fetch(const float *const rows[4], const float *window, long s, vec r
     im[1] = SHUFFLED(ab, cd, 2, 3, 6, 7);
 }
 
-/* The even or odd outputs of a butterfly of the first pass, turned by their twiddles, to points at, at + 1 .. */
+/* The even or odd outputs of a butterfly of the first pass, turned by their twiddles. */
 INLINE void first_half(const int odd, const float *w, vec ar[4], vec ai[4], spectrum to, long at)
 {
     for (int n = 0; n < 4; n++) {
@@ -107,7 +108,7 @@ STEP void first_pass(const locagen_fft *fft, const float *const rows[4], spectru
     }
 }
 
-/* Inputs j of a butterfly, `apart` points from each other, and every `step`-th of its outputs from `first` on. */
+/* The inputs of a butterfly, `apart` points from each other. */
 INLINE void gather(const int R, spectrum from, long at, long apart, vec re[8], vec im[8])
 {
     for (int j = 0; j < R; j++) {
@@ -116,8 +117,9 @@ INLINE void gather(const int R, spectrum from, long at, long apart, vec re[8], v
     }
 }
 
-INLINE void scatter(const int first, const int step, const float *twiddles, vec ar[4], vec ai[4], spectrum to, long at,
-                    long apart)
+/* Four of its outputs, every `step`-th from `first` on. */
+INLINE void scatter(const int first, const int step, const float *twiddles, vec ar[4], vec ai[4],
+                    spectrum to, long at, long apart)
 {
     for (int n = 0; n < 4; n++) {
         int j = first + step * n;
@@ -194,7 +196,8 @@ STEP void last4(long stride, spectrum from, spectrum to)
 
 /* From rows of samples to bins low..high and their mirror images, in `to`; `work` is lost. Both hold
  * points + 2 quads. */
-INLINE void real_fft(const locagen_fft *fft, const float *const rows[4], long low, long high, spectrum work, spectrum to)
+INLINE void real_fft(const locagen_fft *fft, const float *const rows[4], long low, long high, spectrum work,
+                     spectrum to)
 {
     spectrum a = fft->passes % 2 ? work : to, b = fft->passes % 2 ? to : work;
     first_pass(fft, rows, a);

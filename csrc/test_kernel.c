@@ -67,7 +67,8 @@ typedef struct {
 static bench set_up(locagen_gcc_config config, path chosen)
 {
     enum { MISALIGNED = 3 };
-    bench b = {.config = config, .pairs = config.mics * (config.mics - 1) / 2, .columns = 2 * config.lags + 1};
+    bench b = {.config = config, .columns = 2 * config.lags + 1};
+    b.pairs = config.mics * (config.mics - 1) / 2;
     size_t bytes = locagen_gcc_sizeof(&config);
     b.memory = allocate(bytes + MISALIGNED);
     memset(b.memory, 0xA5, bytes + MISALIGNED);
@@ -109,7 +110,8 @@ static double error_of(const bench *b)
     int first = (int)ceil(c->band_low_hz * (double)c->frame / c->rate_hz);
     int last = (int)floor(c->band_high_hz * (double)c->frame / c->rate_hz);
     int bins = last - first + 1;
-    double *re = allocate(sizeof(double) * (size_t)(c->mics * bins)), *im = allocate(sizeof(double) * (size_t)(c->mics * bins));
+    double *re = allocate(sizeof(double) * (size_t)(c->mics * bins));
+    double *im = allocate(sizeof(double) * (size_t)(c->mics * bins));
     double *turn = allocate(sizeof(double) * (size_t)c->frame);
     double worst = 0;
     for (int n = 0; n < c->frame; n++)
@@ -145,7 +147,8 @@ static double error_of(const bench *b)
                 for (int k = 0; k < bins; k++) {
                     int x = i * bins + k, y = j * bins + k;
                     double angle = two_pi * (first + k) * l / ((double)c->frame * c->oversample);
-                    sum += (re[y] * re[x] + im[y] * im[x]) * cos(angle) - (im[y] * re[x] - re[y] * im[x]) * sin(angle);
+                    sum += (re[y] * re[x] + im[y] * im[x]) * cos(angle);
+                    sum -= (im[y] * re[x] - re[y] * im[x]) * sin(angle);
                 }
                 peak = fmax(peak, fabs(sum / bins));
                 double distance = fabs(row[l + c->lags] - sum / bins);
@@ -222,7 +225,8 @@ static void test_faulty_channels(path chosen)
                 if (n == 99 || faults[fault] == 0.0f)
                     b.in[faulty * 512 + n] = faults[fault];
             int bad = run(&b);
-            CHECK(bad == (faults[fault] == 0.0f ? 0 : 1 << faulty), "%d mics, fault %zu: mask %d", mics, fault, bad);
+            int expected = faults[fault] == 0.0f ? 0 : 1 << faulty;
+            CHECK(bad == expected, "%d mics, fault %zu: mask %d", mics, fault, bad);
             CHECK(b.power[faulty] == 0.0f, "power %g", (double)b.power[faulty]);
             int row = 0, wrong = 0;
             for (int i = 0; i < mics; i++)
@@ -334,6 +338,6 @@ int main(void)
     }
     test_paths_agree();
     test_refusals();
-    printf("%d passed, %d failed (%d vector width%s)\n", passed, failed, path_count, path_count == 1 ? "" : "s");
+    printf("%d passed, %d failed (vector widths: %d)\n", passed, failed, path_count);
     return failed != 0;
 }
