@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import pty
+import socket
 import struct
 import subprocess
 import sys
@@ -256,3 +257,27 @@ def test_devices_lists_or_says_why_not():
         assert done.stdout
     else:
         assert "PortAudio" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("link", "says"),
+    [
+        ("udpout:127.0.0.1:99999", "port '99999' is not a number from 1 to 65535"),
+        ("tcp:127.0.0.1:0", "port '0'"),
+    ],
+)
+def test_a_port_that_cannot_be_is_refused_in_one_line(tmp_path, link, says):
+    path = tmp_path / "s.toml"
+    path.write_text(f'[mavlink]\nlink = "{link}"\n')
+    fails(1, says, "run", "--settings", path)
+
+
+def test_a_port_that_is_taken_is_told_while_the_daemon_goes_on(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        path = tmp_path / "s.toml"
+        path.write_text(f'[mavlink]\nlink = "udpin:127.0.0.1:{taken.getsockname()[1]}"\n')
+        done = cli("run", "--seconds", "1.5", "--settings", path)
+    assert done.returncode == 0, done.stderr
+    assert "down: Address already in use" in done.stderr
+    assert "link down: Address already in use" in done.stdout
