@@ -3,7 +3,7 @@
     python bench/bench_accuracy.py [--trials 500] [--quick] [--output FILE]
 
 Plain noise: a far caller on the horizon in the free field, exact fractional delays, noise of each
-microphone's own, SNR over 0 to half the rate, one frame of 0.1 s. Rotor noise: a caller below, SNR in the band,
+microphone's own, SNR over 0 to half the rate, one frame of 0.1 s. Rotor noise: a caller below, in-band SNR,
 four simulated rotors and sensor noise 20 dB below them.
 
 Each trial is a stream: noise alone for two seconds, then the frame that is judged. This project's chain hears
