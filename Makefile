@@ -79,11 +79,22 @@ build/test_kernel: csrc/test_kernel.c $(KERNEL_C) $(wildcard csrc/*.h)
 	@mkdir -p build
 	$(CC) $(CFLAGS_C) -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -Icsrc -o $@ csrc/test_kernel.c $(KERNEL_C) -lm
 
+.PHONY: csrc-test-aarch64
+csrc-test-aarch64: ## the same for aarch64 under qemu-user
+	@command -v aarch64-linux-gnu-gcc qemu-aarch64-static >/dev/null || { echo "skipped: sudo apt install gcc-aarch64-linux-gnu qemu-user-static"; exit 0; }; \
+	mkdir -p build && aarch64-linux-gnu-gcc $(CFLAGS_C) -O3 -static -Icsrc -o build/test_kernel_aarch64 csrc/test_kernel.c $(KERNEL_C) -lm && \
+	qemu-aarch64-static build/test_kernel_aarch64
+
+.PHONY: nightly
+nightly: $(VENV)/.dev csrc-test csrc-test-aarch64 ## the tests with many more and new examples
+	LOCAGEN_NIGHTLY=1 $(BIN)/python -m pytest
+
 .PHONY: bench
 bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(call need,libfftw3-dev,comparing with FFTW)
 	$(BIN)/python bench/bench_kernel.py
 	$(BIN)/python bench/bench_pipeline.py
+	$(BIN)/python bench/bench_accuracy.py --trials 100
 
 .PHONY: models
 models: $(VENV)/.dev ## trains the models anew

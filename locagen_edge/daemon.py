@@ -206,7 +206,7 @@ class Daemon:
             self._send()
             if time.monotonic() < next_s:
                 continue
-            next_s += 1.0
+            next_s = max(next_s, time.monotonic() - 1.0) + 1.0  # after a suspension no second is made up for
             if self._on_second is not None:
                 self._on_second(self)
             if self.hearing:

@@ -15,7 +15,11 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 hypothesis_settings.register_profile(
     "laws", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
-hypothesis_settings.load_profile("laws")
+# New examples every night, and many more of them.
+hypothesis_settings.register_profile(
+    "nightly", deadline=None, max_examples=2000, suppress_health_check=[HealthCheck.too_slow]
+)
+hypothesis_settings.load_profile("nightly" if os.environ.get("LOCAGEN_NIGHTLY") else "laws")
 
 ROOT = Path(__file__).resolve().parent.parent
 
