@@ -55,8 +55,14 @@ class BladeRate:
         return turns
 
 
-def rotor(throttle: float, rate_hz: float, top_hz: float, rng: np.random.Generator) -> Iterator[F64]:
-    """The endless sound of one rotor in pieces (any,): in-band power 1 on average, nothing above `top_hz`."""
+def rotor(
+    throttle: float, rate_hz: float, top_hz: float, rng: np.random.Generator, piece: int = PIECE
+) -> Iterator[F64]:
+    """The endless sound of one rotor in pieces (any,): in-band power 1 on average, nothing above `top_hz`.
+
+    `piece` samples of noise are made at once; the first piece yielded is `piece - OVERLAP` long, and its
+    broadband part fades in over OVERLAP samples.
+    """
     blades = BladeRate(throttle, rng)
     amplitudes = _amplitudes(blades, rate_hz, top_hz)
     table = wavetable(amplitudes, rng)
@@ -65,7 +71,7 @@ def rotor(throttle: float, rate_hz: float, top_hz: float, rng: np.random.Generat
 
     def noise() -> Iterator[F64]:
         while True:
-            yield band_noise(PIECE, rate_hz, LOW_HZ, top_hz, rng, slope=1.0)
+            yield band_noise(piece, rate_hz, LOW_HZ, top_hz, rng, slope=1.0)
 
     start = 0
     for broadband in joined(noise(), OVERLAP):
