@@ -32,10 +32,10 @@ def blade_rate_hz(throttle: float) -> float:
     return BLADES * (IDLE_REV_S + throttle * (FULL_REV_S - IDLE_REV_S))
 
 
-def hubs_m(rotors: int, arm_m: float) -> F64:
-    """(rotors, 3): hubs evenly around the origin in the array's plane, none straight ahead (an X frame)."""
+def hubs_m(rotors: int, arm_m: float, z_m: float = 0.0) -> F64:
+    """(rotors, 3): hubs evenly around the origin, `z_m` below it, none straight ahead (an X frame)."""
     azimuth = np.pi / max(rotors, 1) * (2.0 * np.arange(rotors) + 1.0)
-    return arm_m * np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(rotors)], axis=1)
+    return arm_m * np.stack([np.cos(azimuth), np.sin(azimuth), np.full(rotors, z_m / arm_m)], axis=1)
 
 
 class BladeRate:

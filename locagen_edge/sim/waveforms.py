@@ -23,7 +23,6 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from locagen_edge.geometry import MicArray
 from locagen_edge.settings import setting
@@ -82,7 +81,11 @@ class SceneSettings:
         -30.0, "In-band level of the call where twin.snr_db holds.", unit="dBFS", least=-120, most=20
     )
     snr_span_db: float = setting(
-        0.0, "The SNR is drawn from twin.snr_db to this much above, uniform in dB.", unit="dB", least=0, most=140
+        0.0,
+        "The SNR is drawn from twin.snr_db to this much above, uniform in dB.",
+        unit="dB",
+        least=0,
+        most=140,
     )
     snr_at_m: float = setting(
         0.0,
@@ -91,13 +94,15 @@ class SceneSettings:
         least=0,
         most=10000,
     )
-    ground: float = setting(
-        0.0, "Reflection coefficient of flat ground; 0: none.", least=-1, most=1
-    )
+    ground: float = setting(0.0, "Reflection coefficient of flat ground; 0: none.", least=-1, most=1)
     mouth_m: float = setting(1.5, "Height of the source above that ground.", unit="m", least=0, most=100)
     rotors: int = setting(0, "Number of rotors.", unit="rotors", least=0, most=8)
     rotor_arm_m: float = setting(
-        0.30, "Distance of each hub from the middle of the array, seen from above.", unit="m", least=0.02, most=5
+        0.30,
+        "Distance of each hub from the middle of the array, seen from above.",
+        unit="m",
+        least=0.02,
+        most=5,
     )
     rotor_z_m: float = setting(0.0, "How far the hubs are below the array.", unit="m", least=-5, most=5)
     rotor_snr_db: float = setting(
@@ -118,7 +123,11 @@ class SceneSettings:
         (0.0, 0.0, 0.0), "Gain of each microphone's channel.", unit="dB", least=-60, most=60
     )
     gain_error_db: float = setting(
-        0.0, "Each gain is off by up to this, uniform in dB, anew for every sample.", unit="dB", least=0, most=60
+        0.0,
+        "Each gain is off by up to this, uniform in dB, anew for every sample.",
+        unit="dB",
+        least=0,
+        most=60,
     )
     bits: int = setting(
         16, "Word length of the converter, which clips at 0 dBFS; 0: neither.", unit="bits", least=0, most=24
@@ -251,7 +260,7 @@ class Studio:
         error = rng.uniform(-twin.position_error_m, twin.position_error_m, (count, mics, 2))
         mics_m = np.broadcast_to(self.places_m, (count, mics, 3)).copy()
         mics_m[..., :2] += error
-        range_m = np.linalg.norm(source_m, axis=1)
+        range_m: F64 = np.linalg.norm(source_m, axis=1)
 
         kinds, signal = self._calls(count, rng)
         call_power, sensor_power, rotor_power = self._powers(range_m, rng)
@@ -373,7 +382,7 @@ class Studio:
     def _utterance(self, kind: str, rng: np.random.Generator) -> tuple[str, F32]:
         """Its name, and (size,) cut from where it is loud."""
         if kind == RECORDED:
-            file, sound = self.recorded[rng.integers(len(self.recorded))]
+            file, sound = self.recorded[int(rng.integers(len(self.recorded)))]
             name, whole = f"{RECORDED}:{file}", np.pad(sound, max(self.size - self.n // 4, 0))
         else:
             length = max(self.size, round(UTTERANCE_S * self.rate_hz))
@@ -391,7 +400,7 @@ class Studio:
         if not scene.rotors:
             return total
         throttle = rng.uniform(scene.throttle[0], scene.throttle[1], count)
-        hubs = hubs_m(scene.rotors, scene.rotor_arm_m) + [0.0, 0.0, scene.rotor_z_m]
+        hubs = hubs_m(scene.rotors, scene.rotor_arm_m, scene.rotor_z_m)
         away_s = float(np.linalg.norm(hubs[0])) / self.speed_m_s  # all hubs are as far
         loudness = np.zeros(mics_m.shape[:2])
         for hub in hubs:

@@ -1,4 +1,4 @@
-"""Wind in the microphones: turbulence that drifts past, loud at low frequencies, partly the same in near ones.
+"""Wind in the microphones: turbulence that drifts past, loud at low frequencies, partly coherent.
 
 Spectrum: stagnation pressure of turbulence, level up to the frequency at which eddies of the turbulence's own
 size drift past, then falling as f ** -5/3 (Morgan & Raspet, J. Acoust. Soc. Am. 92 (1992) 1180-1183).
@@ -49,10 +49,8 @@ def coherence(positions_m: F64, heading_rad: F64, frequency_hz: F64, wind_m_s: f
     return partly
 
 
-def wind(
-    positions_m: F64, frequency_hz: F64, size: int, wind_m_s: float, rng: np.random.Generator
-) -> C64:
-    """Spectra (samples, mics, bins) of wind at microphones (samples, mics, 3), each from a heading of its own.
+def wind(positions_m: F64, frequency_hz: F64, size: int, wind_m_s: float, rng: np.random.Generator) -> C64:
+    """Spectra (samples, mics, bins) of wind at microphones (samples, mics, 3), from random headings.
 
     `frequency_hz` (bins,) are the first bins of a real FFT of `size` samples, whose mean square is 1 on
     average.
