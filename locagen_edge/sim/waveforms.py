@@ -202,7 +202,8 @@ class Studio:
     @cached_property
     def places_m(self) -> F64:
         """(mics, 3) from the array's middle."""
-        return self.array.positions_m - self.array.positions_m.mean(axis=0)
+        places: F64 = self.array.positions_m - self.array.positions_m.mean(axis=0)
+        return places
 
     @cached_property
     def margin(self) -> int:
@@ -228,8 +229,7 @@ class Studio:
     def frequency_hz(self) -> F64:
         """(bins,) as far as anything sounds."""
         bins = math.floor(self.top_hz * self.size / self.rate_hz) + 1
-        frequency: F64 = np.arange(bins) * (self.rate_hz / self.size)
-        return frequency
+        return np.arange(bins, dtype=np.float64) * (self.rate_hz / self.size)
 
     @cached_property
     def onset(self) -> int:

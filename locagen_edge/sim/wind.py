@@ -56,7 +56,7 @@ def wind(positions_m: F64, frequency_hz: F64, size: int, wind_m_s: float, rng: n
     average.
     """
     count, mics = positions_m.shape[:2]
-    heading = rng.uniform(-np.pi, np.pi, count)
+    heading = rng.uniform(-np.pi, np.pi, (count,))
     shape = power(frequency_hz[1:], wind_m_s)  # nothing at 0 Hz
     matrix = coherence(positions_m, heading, frequency_hz[1:], wind_m_s)
     # 1e-9: at the lowest bins the microphones hear the same, and rounding must not make it more than that
