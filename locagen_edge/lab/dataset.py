@@ -15,6 +15,7 @@ import fcntl
 import os
 import sys
 from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -91,17 +92,16 @@ def make(folder: Path, settings: LabSettings, workers: int = 1, scheduler: str =
 
 def complete(folder: Path, settings: LabSettings) -> set[int]:
     """Numbers of the shards that are there. Raises `DatasetError` where one is not of these settings."""
+    asked, recordings = plain_toml(settings), metadata(settings, 0)["recordings"]
     numbers = set()
     for path in sorted(folder.glob("shard-*.parquet")):
         told = read_metadata(path)
-        different = differences(told["settings"], plain_toml(settings))
+        different = differences(told["settings"], asked)
         if told["version"] != __version__:
             different.append(f"version: {told['version']} there, {__version__} asked for")
         if not different:
             number = int(told["shard"])
-            asked = metadata(settings, number)
-            # the same settings in all that matters: only the recorded files can still be others
-            if told["recordings"] != asked["recordings"]:
+            if told["recordings"] != recordings:
                 different.append("scene.recordings: other files than those there now")
             if path != shard_path(folder, number):
                 different.append(f"{path.name}: is shard {number} by what it says of itself")
@@ -173,7 +173,8 @@ def _on_cluster(address: str) -> _Runner:
     def run(jobs: Jobs) -> Generator[int, None, None]:
         try:
             from distributed import Client, KilledWorker, as_completed
-        except ImportError as error:
+            from distributed.comm.core import CommClosedError
+        except ModuleNotFoundError as error:
             raise DatasetError("--scheduler needs Dask: pip install 'locagen-edge[lab]'") from error
         try:
             client = Client(  # type: ignore[no-untyped-call]
@@ -187,11 +188,15 @@ def _on_cluster(address: str) -> _Runner:
             futures = [client.submit(write_shard, *job, pure=False) for job in jobs]
             try:
                 for _, number in as_completed(  # type: ignore[no-untyped-call]
-                    futures, with_results=True
+                    futures, loop=client.loop, with_results=True
                 ):
                     yield number
             except KilledWorker as error:
                 raise DatasetError(f"the cluster lost several workers over one shard: {error}") from error
+            except (CancelledError, CommClosedError) as error:
+                raise DatasetError(
+                    f"--scheduler {address}: was lost; the same command goes on with another"
+                ) from error
 
     return run
 
