@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -196,6 +197,29 @@ def test_a_killed_run_loses_the_shards_in_hand_and_goes_on(tmp_path, workers):
         assert shards(folder) == shards(tmp_path / "whole")
 
 
+def test_a_worker_that_is_killed_ends_the_run_with_one_line(tmp_path):
+    settings = settings_of("waveforms", samples=20_000, shard=200)
+    folder = tmp_path / "set"
+    process = start(command(folder, settings, "--workers", "2"))
+    wait_for(lambda: len(list(folder.glob("shard-*"))) >= 2, process)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    if not children.exists():
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        pytest.skip("this kernel does not tell who the workers are")
+    workers = [
+        pid
+        for pid in map(int, children.read_text().split())
+        if b"resource_tracker" not in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]
+    os.kill(workers[0], signal.SIGKILL)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert len(errors.splitlines()) == 1, errors
+    assert "ended from outside" in errors
+    assert complete(folder, settings)
+
+
 def test_an_interrupted_run_says_so_in_one_line(tmp_path):
     settings = settings_of("waveforms", samples=20_000, shard=200)
     process = start(command(tmp_path / "set", settings))
@@ -210,6 +234,8 @@ def test_an_interrupted_run_says_so_in_one_line(tmp_path):
 
 def small_disk(folder):
     """A file system of 200 KiB at `folder`, or None where nobody may mount one."""
+    if shutil.which("mount") is None:
+        return None
     done = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", str(folder)], check=False, capture_output=True
     )

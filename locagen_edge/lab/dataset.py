@@ -12,6 +12,7 @@ On a cluster the workers write, so the folder has to be on a file system that al
 from __future__ import annotations
 
 import fcntl
+import logging
 import os
 import sys
 from collections.abc import Generator, Iterable, Iterator
@@ -183,14 +184,13 @@ def _on_cluster(address: str) -> _Runner:
             client.wait_for_workers(1, timeout=NO_WORKER_S)
         except (OSError, ValueError, TimeoutError) as error:
             raise DatasetError(f"--scheduler {address}: no scheduler with a worker there: {error}") from error
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its tracebacks; what matters is raised
         with client:
             # not pure: a key of its own for every run, lest an earlier run's result is taken for done
             futures = [client.submit(write_shard, *job, pure=False) for job in jobs]
             try:
-                for _, number in as_completed(  # type: ignore[no-untyped-call]
-                    futures, loop=client.loop, with_results=True
-                ):
-                    yield number
+                for future in as_completed(futures, loop=client.loop):  # type: ignore[no-untyped-call]
+                    yield future.result()
             except KilledWorker as error:
                 raise DatasetError(f"the cluster lost several workers over one shard: {error}") from error
             except (CancelledError, CommClosedError) as error:
