@@ -247,7 +247,7 @@ class Studio:
     @cached_property
     def fade(self) -> F32:
         """(size,) that brings a sound to zero at both ends."""
-        rise = 0.5 - 0.5 * np.cos(np.pi * (np.arange(FADE) + 0.5) / FADE)
+        rise = rising(FADE)
         gain = np.ones(self.size, dtype=np.float32)
         gain[:FADE] = rise
         gain[-FADE:] = rise[::-1]
@@ -363,8 +363,8 @@ class Studio:
             tape = np.fft.irfft(spectra, self.size, axis=1).astype(np.float32, copy=False)
             if self.onset:
                 tape[:, : self.called.start] = 0.0
-                rise = min(round(ONSET_S * self.rate_hz), self.size - self.called.start)
-                tape[:, self.called.start : self.called.start + rise] *= np.linspace(0.0, 1.0, rise)
+                rise = rising(min(round(ONSET_S * self.rate_hz), self.size - self.called.start))
+                tape[:, self.called.start : self.called.start + len(rise)] *= rise
                 spectra = np.fft.rfft(tape, axis=1)[:, : spectra.shape[1]].astype(np.complex64)
             power = band_powers(tape[:, self.called], self.rate_hz)
         spectra /= np.sqrt(np.maximum(power, 1e-20)).astype(np.float32)[:, np.newaxis]
@@ -459,6 +459,12 @@ class Studio:
             return np.stack([drifted(part, self.size, self.margin + moments) for part in heard])
         sound: F32 = np.fft.irfft(heard, self.size, axis=-1)[..., self.kept].astype(np.float32, copy=False)
         return sound
+
+
+def rising(n: int) -> F32:
+    """(n,) from 0 to 1 with no corner, so that little is heard above the band."""
+    rise: F64 = 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / n)
+    return rise.astype(np.float32)
 
 
 # --- frequency domain ---------------------------------------------------------------------------------
