@@ -3,7 +3,8 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-CFLAGS_C := -std=gnu11 -Wall -Wextra -Werror -fno-math-errno -fno-trapping-math -fassociative-math -fno-signed-zeros
+CFLAGS_C := -std=gnu11 -Wall -Wextra -Werror -fno-math-errno -fno-trapping-math
+KERNEL_C := $(filter-out csrc/test_kernel.c, $(wildcard csrc/*.c))
 KERNEL := $(wildcard csrc/*.c csrc/*.h) csrc/build_kernel.py setup.py pyproject.toml
 SYSTEMD_DIR := /lib/systemd/system
 SYSUSERS_DIR := /usr/lib/sysusers.d
@@ -74,14 +75,15 @@ $(VENV)/.dev: $(VENV)/.flight
 csrc-test: build/test_kernel ## the kernel's laws in C, under ASan and UBSan
 	./build/test_kernel
 
-build/test_kernel: csrc/test_kernel.c csrc/fft.c csrc/gcc_phat.c $(wildcard csrc/*.h)
+build/test_kernel: csrc/test_kernel.c $(KERNEL_C) $(wildcard csrc/*.h)
 	@mkdir -p build
-	$(CC) $(CFLAGS_C) -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -Icsrc -o $@ csrc/test_kernel.c csrc/fft.c csrc/gcc_phat.c -lm
+	$(CC) $(CFLAGS_C) -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -Icsrc -o $@ csrc/test_kernel.c $(KERNEL_C) -lm
 
 .PHONY: bench
 bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(call need,libfftw3-dev,comparing with FFTW)
 	$(BIN)/python bench/bench_kernel.py
+	$(BIN)/python bench/bench_pipeline.py
 
 .PHONY: models
 models: $(VENV)/.dev ## trains the models anew
@@ -94,6 +96,8 @@ install: ## as root: program, unit, user and sample settings; DESTDIR is honoure
 	install -d $(DESTDIR)$(LIB_DIR) $(DESTDIR)$(ETC_DIR) $(DESTDIR)$(SYSTEMD_DIR) $(DESTDIR)$(SYSUSERS_DIR)
 	$(PYTHON) -m venv $(DESTDIR)$(LIB_DIR)
 	$(DESTDIR)$(LIB_DIR)/bin/pip install -q .
+	@# scripts name their interpreter: the place where it will be, not where it is packed
+	@test -z "$(DESTDIR)" || grep -rlI '^#!$(DESTDIR)' $(DESTDIR)$(LIB_DIR)/bin | xargs -r sed -i '1s|^#!$(DESTDIR)|#!|'
 	install -m 644 systemd/locagen-edge.service $(DESTDIR)$(SYSTEMD_DIR)/
 	install -m 644 systemd/locagen-edge.sysusers $(DESTDIR)$(SYSUSERS_DIR)/locagen-edge.conf
 	test -e $(DESTDIR)$(ETC_DIR)/locagen-edge.toml || install -m 644 systemd/locagen-edge.toml $(DESTDIR)$(ETC_DIR)/

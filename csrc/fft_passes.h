@@ -24,8 +24,8 @@ INLINE void dft4(vec re[4], vec im[4])
     re[3] = dr - ei, im[3] = di + er;
 }
 
-/* The even outputs of radix 8, 0 2 4 6, in a[0..3]. Odd and even ones are made one after the other, each from the
- * eight inputs: sixteen registers hold one half, not both. */
+/* The even outputs of radix 8, 0 2 4 6, in a[0..3]. Odd and even ones are made one after the other, each
+ * from the eight inputs: sixteen registers hold one half, not both. */
 INLINE void dft8_even(const vec re[8], const vec im[8], vec ar[4], vec ai[4])
 {
     for (int j = 0; j < 4; j++)
@@ -57,8 +57,9 @@ INLINE void times(vec *re, vec *im, vec wr, vec wi)
     *re = r;
 }
 
-/* WIDTH samples of four rows, times the window, as two vectors of complex points: with samples s, s + 1 ..
- * the first holds (s, s + 1) and, eight lanes wide, (s + 4, s + 5); the second (s + 2, s + 3), (s + 6, s + 7). */
+/* WIDTH samples of four rows, times the window, as two vectors of complex points: from sample s on, the
+ * first holds the point (s, s + 1), the second (s + 2, s + 3); eight wide, (s + 4, s + 5) and (s + 6, s + 7)
+ * follow in the upper halves. */
 INLINE void fetch(const float *const rows[4], const float *window, long s, vec re[2], vec im[2])
 {
     vec w = load(window + s);
@@ -70,6 +71,18 @@ INLINE void fetch(const float *const rows[4], const float *window, long s, vec r
     ab = SHUFFLED(a, b, 2, 6, 3, 7), cd = SHUFFLED(c, d, 2, 6, 3, 7);
     re[1] = SHUFFLED(ab, cd, 0, 1, 4, 5);
     im[1] = SHUFFLED(ab, cd, 2, 3, 6, 7);
+}
+
+/* The even or odd outputs of a butterfly of the first pass, turned by their twiddles. */
+INLINE void first_half(const int odd, const float *w, vec ar[4], vec ai[4], spectrum to, long at)
+{
+    for (int n = 0; n < 4; n++) {
+        int j = 2 * n + odd;
+        if (j > 0)
+            times(&ar[n], &ai[n], load(w + 16 * (j - 1)), load(w + 16 * (j - 1) + 8));
+        store_apart(to.re + 4 * (at + j), 4 * 8 * 2, ar[n]);
+        store_apart(to.im + 4 * (at + j), 4 * 8 * 2, ai[n]);
+    }
 }
 
 STEP void first_pass(const locagen_fft *fft, const float *const rows[4], spectrum to)
@@ -86,53 +99,59 @@ STEP void first_pass(const locagen_fft *fft, const float *const rows[4], spectru
         for (int e = 0; e < 2; e++) {
             long place = (p & ~3L) + 2 * e + ((p >> 1) & 1);
             const float *w = fft->first + (place >> 1) * 7 * 16 + (place & 1) * 4;
-            for (int odd = 0; odd < 2; odd++) {
-                vec ar[4], ai[4];
-                if (odd)
-                    dft8_odd(re[e], im[e], ar, ai);
-                else
-                    dft8_even(re[e], im[e], ar, ai);
-                for (int n = 0; n < 4; n++) {
-                    int j = 2 * n + odd;
-                    if (j > 0)
-                        times(&ar[n], &ai[n], load(w + 16 * (j - 1)), load(w + 16 * (j - 1) + 8));
-                    store_apart(to.re + 4 * (8 * (p + e) + j), 4 * 8 * 2, ar[n]);
-                    store_apart(to.im + 4 * (8 * (p + e) + j), 4 * 8 * 2, ai[n]);
-                }
-            }
+            vec ar[4], ai[4];
+            dft8_even(re[e], im[e], ar, ai);
+            first_half(0, w, ar, ai, to, 8 * (p + e));
+            dft8_odd(re[e], im[e], ar, ai);
+            first_half(1, w, ar, ai, to, 8 * (p + e));
         }
     }
 }
 
-/* A pass of radix R over transforms of `length` points, `stride` of them side by side. */
-INLINE void pass(const int R, const int last, long length, long stride, const float *twiddles, spectrum from, spectrum to)
+/* The inputs of a butterfly, `apart` points from each other. */
+INLINE void gather(const int R, spectrum from, long at, long apart, vec re[8], vec im[8])
+{
+    for (int j = 0; j < R; j++) {
+        re[j] = load(from.re + 4 * (at + apart * j));
+        im[j] = load(from.im + 4 * (at + apart * j));
+    }
+}
+
+/* Four of its outputs, every `step`-th from `first` on. */
+INLINE void scatter(const int first, const int step, const float *twiddles, vec ar[4], vec ai[4],
+                    spectrum to, long at, long apart)
+{
+    for (int n = 0; n < 4; n++) {
+        int j = first + step * n;
+        if (j > 0 && twiddles != NULL)
+            times(&ar[n], &ai[n], all(twiddles[2 * j - 2]), all(twiddles[2 * j - 1]));
+        store(to.re + 4 * (at + apart * j), ar[n]);
+        store(to.im + 4 * (at + apart * j), ai[n]);
+    }
+}
+
+/* A pass of radix R over transforms of `length` points, `stride` of them side by side. The last one has no
+ * twiddles. */
+INLINE void pass(const int R, long length, long stride, const float *twiddles, spectrum from, spectrum to)
 {
     long part = length / R;
-    for (long p = 0; p < part; p++, twiddles += 2 * (R - 1))
+    for (long p = 0; p < part; p++) {
         for (long q = 0; q < stride; q += QUADS) {
-            for (int odd = 0; odd < R / 4; odd++) {
-                vec re[8], im[8];
-                for (int j = 0; j < R; j++) {
-                    long at = 4 * (q + stride * (p + part * j));
-                    re[j] = load(from.re + at), im[j] = load(from.im + at);
-                }
-                vec ar[4], ai[4];
-                if (R == 4) {
-                    memcpy(ar, re, sizeof ar), memcpy(ai, im, sizeof ai);
-                    dft4(ar, ai);
-                } else if (odd)
-                    dft8_odd(re, im, ar, ai);
-                else
-                    dft8_even(re, im, ar, ai);
-                for (int n = 0; n < 4; n++) {
-                    int j = R / 4 * n + odd;
-                    long at = 4 * (q + stride * (R * p + j));
-                    if (j > 0 && !last)
-                        times(&ar[n], &ai[n], all(twiddles[2 * j - 2]), all(twiddles[2 * j - 1]));
-                    store(to.re + at, ar[n]), store(to.im + at, ai[n]);
-                }
+            vec re[8], im[8], ar[4], ai[4];
+            gather(R, from, q + stride * p, stride * part, re, im);
+            if (R == 4) {
+                dft4(re, im);
+                scatter(0, 1, twiddles, re, im, to, q + stride * R * p, stride);
+            } else {
+                dft8_even(re, im, ar, ai);
+                scatter(0, 2, twiddles, ar, ai, to, q + stride * R * p, stride);
+                dft8_odd(re, im, ar, ai);
+                scatter(1, 2, twiddles, ar, ai, to, q + stride * R * p, stride);
             }
         }
+        if (twiddles != NULL)
+            twiddles += 2 * (R - 1);
+    }
 }
 
 /* Parts the complex transform into the bins low..high of the real signals, and their mirror images
@@ -152,19 +171,33 @@ STEP void part(const locagen_fft *fft, long low, long high, spectrum from, spect
     }
 }
 
-#define PASS(name, R, last)                                                                                  \
-    STEP void name(long length, long stride, const float *twiddles, spectrum from, spectrum to)              \
-    {                                                                                                        \
-        pass(R, last, length, stride, twiddles, from, to);                                                   \
-    }
-PASS(middle8, 8, 0)
-PASS(middle4, 4, 0)
-PASS(last8, 8, 1)
-PASS(last4, 4, 1)
+STEP void middle8(long length, long stride, const float *twiddles, spectrum from, spectrum to)
+{
+    if (stride == 8)
+        pass(8, length, 8, twiddles, from, to);
+    else
+        pass(8, length, stride, twiddles, from, to);
+}
+
+STEP void middle4(long length, long stride, const float *twiddles, spectrum from, spectrum to)
+{
+    pass(4, length, stride, twiddles, from, to);
+}
+
+STEP void last8(long stride, spectrum from, spectrum to)
+{
+    pass(8, 8, stride, NULL, from, to);
+}
+
+STEP void last4(long stride, spectrum from, spectrum to)
+{
+    pass(4, 4, stride, NULL, from, to);
+}
 
 /* From rows of samples to bins low..high and their mirror images, in `to`; `work` is lost. Both hold
  * points + 2 quads. */
-INLINE void real_fft(const locagen_fft *fft, const float *const rows[4], long low, long high, spectrum work, spectrum to)
+INLINE void real_fft(const locagen_fft *fft, const float *const rows[4], long low, long high, spectrum work,
+                     spectrum to)
 {
     spectrum a = fft->passes % 2 ? work : to, b = fft->passes % 2 ? to : work;
     first_pass(fft, rows, a);
@@ -172,7 +205,7 @@ INLINE void real_fft(const locagen_fft *fft, const float *const rows[4], long lo
     for (int n = 1; n < fft->passes; n++) {
         int radix = fft->radix[n];
         if (n == fft->passes - 1)
-            (radix == 8 ? last8 : last4)(length, stride, NULL, a, b);
+            (radix == 8 ? last8 : last4)(stride, a, b);
         else
             (radix == 8 ? middle8 : middle4)(length, stride, fft->middle[n], a, b);
         length /= radix, stride *= radix;

@@ -4,11 +4,11 @@
  * inverse FFT of the frame's own length would take. A frame of N samples whose lags all lie within
  * +-L has a correlation that is smooth in frequency, so its bins may be thinned out D to 1 behind an
  * anti-aliasing window (the gridding step of the non-uniform FFT: Fessler & Sutton 2003, "Nonuniform fast
- * Fourier transforms using min-max interpolation"): each bin is spread over four coarse bins with the
+ * Fourier transforms using min-max interpolation"): each bin is spread over six coarse bins with the
  * weights of a Kaiser-Bessel window. The correlation comes out multiplied by the window's transform,
- * which is known and divided out; its images at multiples of N / D lags come out multiplied by the
- * window's side lobes, at most exp(-4 pi sqrt(1 - 2 L D / N)) = 2e-5 as D is chosen here. With N = 1024 and
- * L = 4, 451 bins become 18, and a short table of cosines makes the lags from them.
+ * which is known and divided out; its images, N / D lags apart, come out multiplied by the window's side
+ * lobes, which are small there. With N = 1024 and L = 4, 451 bins become 20, and a short table of cosines
+ * makes the lags from them.
  */
 #include "gcc_phat.h"
 
@@ -18,7 +18,9 @@
 
 static const double PI = 3.14159265358979323846;
 
-/* The least N / (2 L D): exp(-4 pi sqrt(1 - 1 / 3.9)) = 2e-5, a fifth of the 1e-4 that the kernel promises. */
+/* The least N / (2 L D). An image as strong as the peak itself then leaves 3e-6 of it (computed over all
+ * lags and places of a bin); at 2 it would leave 4e-5, too much where an echo outside the lags is the
+ * stronger one. With four taps instead of six it would be 4e-4. */
 static const double LEAST_OVERSAMPLING = 3.9;
 
 enum {
@@ -205,8 +207,10 @@ static void fill_synthesis(state *s, int oversample)
 {
     int block_lags = 2 * BLOCK_HALF + 1;
     for (int c = 0; c < s->coarse; c++) {
-        double bin = s->decimation == 1 ? (s->first_bin & ~1) + c
-                                        : (s->first_bin / s->decimation - (TAPS / 2 - 1) + c) * s->decimation - 0.5;
+        /* Coarse bins lie half a bin below their block, so that no bin falls on the window's edge. */
+        double bin = (s->first_bin & ~1) + c;
+        if (s->decimation > 1)
+            bin = (s->first_bin / s->decimation - (TAPS / 2 - 1) + c) * s->decimation - 0.5;
         double turns = bin / ((double)s->samples * oversample);
         float *row = s->table + 2 * (size_t)c * (size_t)s->table_lags;
         for (int l = 0; l < s->table_lags; l++)
@@ -239,8 +243,8 @@ int locagen_gcc_init(locagen_gcc *memory, const locagen_gcc_config *config)
     take(&room, sizeof *s / sizeof(float) + 1);
     lay_out(s, config, &room);
 
-    /* With this gain the squared magnitude of a bin is its power: 2 / (N sum(w^2)) |X|^2, where the squares of
-     * Hann's window add up to 3 N / 8, and a half goes to the parting of the real bins. */
+    /* With this gain the squared magnitude of a bin is its power: 2 / (N sum(w^2)) |X|^2, where the squares
+     * of Hann's window add up to 3 N / 8, and a half goes to the parting of the real bins. */
     double gain = 0.5 * sqrt(2 / (config->frame * (0.375 * config->frame)));
     locagen_fft_init(&s->fft, config->frame, gain, take(&room, locagen_fft_floats(config->frame)));
     fill_spreading(s, 2.0 * config->lags / config->oversample);
@@ -276,7 +280,7 @@ const char *locagen_strerror(int code)
     case LOCAGEN_E_BAND:
         return "band: must be 0 < low < high < rate / 2 and hold at least eight bins of the frame";
     case LOCAGEN_E_LAGS:
-        return "lags: oversample must be 1 to 64, lags at least 1, and the longest lag under a quarter of the frame";
+        return "lags: oversample must be 1 to 64, lags at least 1, longest lag below frame / 4";
     case LOCAGEN_E_FLOOR:
         return "floors: must be at least 0 and below 1";
     case LOCAGEN_E_NULL:

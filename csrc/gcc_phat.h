@@ -39,7 +39,7 @@ typedef struct state {
     float *coarse_re, *coarse_im;     /* quads */
     int32_t blocks, half, table_lags; /* blocks of lags; lags each side of a centre; the same, padded, with 0 */
     float *table;                     /* [coarse bin][cos, sin][table_lags] */
-    float *start, *step;              /* phasors, re and im, of each coarse bin: to the first block, to the next */
+    float *start, *step;              /* phasors of each coarse bin: to the first block, to the next */
     float *gain;                      /* of each lag */
 } state;
 

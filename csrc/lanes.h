@@ -3,7 +3,7 @@
  * Four lanes hold the same sample or bin of four microphones; a vector of WIDTH floats (4 on SSE and
  * NEON, 8 on AVX) holds one such quad or two neighbouring ones. A file that defines WIDTH and includes
  * this header is compiled for that width; the code above it does not ask which. Only GCC's vector
- * extensions are used (clang has them too), so the same source is SSE, AVX and NEON.
+ * extensions are used (gcc 12 or later; clang has them too), so the same source is SSE, AVX and NEON.
  */
 #ifndef LOCAGEN_LANES_H
 #define LOCAGEN_LANES_H
@@ -76,7 +76,8 @@ INLINE void store_apart(float *p, long apart, vec v)
 /* Indices count through both arguments: 0-7 for quads, 0-15 here; both quads are shuffled alike. */
 #define LOW(i) ((i) + ((i) > 3 ? 4 : 0))
 #define SHUFFLED(a, b, i, j, k, l) \
-    __builtin_shufflevector(a, b, LOW(i), LOW(j), LOW(k), LOW(l), LOW(i) + 4, LOW(j) + 4, LOW(k) + 4, LOW(l) + 4)
+    __builtin_shufflevector(a, b, LOW(i), LOW(j), LOW(k), LOW(l), LOW(i) + 4, LOW(j) + 4, LOW(k) + 4,        \
+                            LOW(l) + 4)
 INLINE quad low(vec v) { return __builtin_shufflevector(v, v, 0, 1, 2, 3); }
 INLINE quad high(vec v) { return __builtin_shufflevector(v, v, 4, 5, 6, 7); }
 INLINE vec joined(quad a, quad b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7); }

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from locagen_edge import __version__
-from locagen_edge.errors import LocagenError, SettingsError
+from locagen_edge.errors import LocagenError, SettingsError, SourceHungError
 from locagen_edge.geometry import compass_deg
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
 from locagen_edge.types import Estimate
@@ -40,6 +40,9 @@ def main(argv: list[str] | None = None) -> None:
         for line in str(error).splitlines():
             print(f"locagen-edge: {line}", file=sys.stderr)
         code = 1
+    except SourceHungError as error:
+        print(f"locagen-edge: {error}", file=sys.stderr, flush=True)
+        os._exit(1)  # an orderly exit would call into the driver that hangs
     except LocagenError as error:
         print(f"locagen-edge: {error}", file=sys.stderr)
         code = 1
@@ -200,7 +203,7 @@ def describe(estimate: Estimate) -> str:
     if truth is not None:
         parts.append(f"true {compass_deg(truth.azimuth_rad):5.1f}°")
     if track is not None and track.elevation_rad is not None:
-        parts.append(f"elevation {math.degrees(track.elevation_rad):3.0f}°")
+        parts.append(f"el {math.degrees(track.elevation_rad):3.0f}°")
     parts.append(f"snr {estimate.detection.snr_db:5.1f} dB {'CALL' if estimate.detection.call else '    '}")
     parts += [f"! {fault}" for fault in estimate.faults]
     return "  ".join(parts)
@@ -286,6 +289,7 @@ def replay(path: Path, settings: Settings) -> Iterator[dict[str, Any]]:
             t_s = frame.start / rate_hz
             bar.update(t_s + frame_s - bar.n)
             yield record(pipeline.process(frame), t_s)
+        bar.update(bar.total - bar.n)  # what is left is shorter than a hop
 
 
 def _width(name: str) -> int:

@@ -85,7 +85,12 @@ class GccPhat:
         self.pairs = tuple((i, j) for i in range(mics) for j in range(i + 1, mics))
         self.lag_s: npt.NDArray[np.float64] = np.arange(-lags, lags + 1) / (oversample * float(rate_hz))
         self._shape = (mics, frame)
-        self._correlation_shape = (len(self.pairs), 2 * lags + 1)
+        # C writes here, the caller gets copies: that is faster than a new pointer for every new array.
+        self._correlation = np.empty((len(self.pairs), 2 * lags + 1), _FLOAT32)
+        self._power = np.empty(mics, _FLOAT32)
+        self._correlation_pointer = ffi.from_buffer(_FLOATS, self._correlation)
+        self._power_pointer = ffi.from_buffer(_FLOATS, self._power)
+        self._process = lib.locagen_gcc_process
 
     def process(
         self, samples: npt.NDArray[np.float32]
@@ -113,9 +118,5 @@ class GccPhat:
             source = ffi.from_buffer(_FLOATS, samples)
         except (AttributeError, TypeError, ValueError, BufferError) as fault:
             raise KernelError(f"samples: a C-contiguous float32 array is needed: {fault}") from fault
-        correlation = np.empty(self._correlation_shape, _FLOAT32)
-        power = np.empty(self._shape[0], _FLOAT32)
-        bad: int = lib.locagen_gcc_process(
-            self._state, source, ffi.from_buffer(_FLOATS, correlation), ffi.from_buffer(_FLOATS, power)
-        )
-        return correlation, power, bad
+        bad: int = self._process(self._state, source, self._correlation_pointer, self._power_pointer)
+        return self._correlation.copy(), self._power.copy(), bad

@@ -218,7 +218,7 @@ class DetectionSettings:
     """When a sound counts as a call."""
 
     snr_db: float = setting(
-        3.0, "In-band level over the tracked background from which a frame is a call.",
+        0.0, "In-band level over the tracked background from which a frame is a call.",
         unit="dB", least=-20, most=60,
     )  # fmt: skip
     misfit: float = setting(

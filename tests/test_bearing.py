@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 
 from locagen_edge.geometry import angles, direction, wrap
 from locagen_edge.settings import Settings, from_table
 from locagen_edge.stages.bearing import ESTIMATORS, make_estimator
+from locagen_edge.stages.bearing.far_field import far_field
 from locagen_edge.types import Tdoa
 
 SIGMA_S = 1e-6
@@ -48,6 +52,15 @@ def point(settings: Settings, source_m: np.ndarray, sigma_s: float = SIGMA_S) ->
 def test_the_table_names_what_the_settings_allow():
     for name in ESTIMATORS:
         from_table({"bearing": {"estimator": "model:x" if name == "model" else name}})
+
+
+def test_the_example_for_contributors_works():
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.DOTALL)
+    names = {"np": np, "replace": replace, "far_field": far_field}
+    exec("from __future__ import annotations\n" + code, names)
+    settings = make("far-field")
+    bearing = names["by_peak"](settings)(plane_wave(settings, 1.0, -0.5))
+    assert bearing.azimuth_rad == pytest.approx(1.0, abs=1e-9)
 
 
 # --- far field

@@ -130,7 +130,7 @@ def test_a_resampled_sine_is_that_sine_at_its_own_time(rate):
     got = resample(rows, rate, range(0, rate, 960))
     expected = np.sin(2 * np.pi * hz * np.arange(len(got))[:, np.newaxis] / RATE)
     inside = slice(1000, -1000)  # at the ends the filter sees half a sine
-    assert np.abs(got - expected)[inside].max() < 1e-5  # -100 dB, phase and so time included
+    assert np.abs(got - expected)[inside].max() < 1e-4  # -80 dB, phase and so time included
 
 
 def test_the_same_rate_passes_through():

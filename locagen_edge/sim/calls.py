@@ -49,7 +49,7 @@ def _syllable(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -
     voiced = wave(wavetable((resonance + 0.01) / harmonics * 100.0, rng), turns_of(pitch, rate_hz))
     hiss = band_noise(n, rate_hz, 0.5 * top_hz, top_hz, rng)
     at = np.arange(n) / n
-    sound: F64 = voiced * np.sin(np.pi * at) ** 0.7 + 1.0 * hiss * at * np.exp(-12.0 * at)
+    sound: F64 = voiced * np.sin(np.pi * at) ** 0.7 + hiss * at * np.exp(-12.0 * at)
     return sound
 
 

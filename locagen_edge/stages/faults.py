@@ -29,9 +29,10 @@ OFFSET = 0.1
 SAME = 1e-3
 """Largest difference, relative to the loudest sample, of two channels that carry one signal."""
 STRONG_PEAK = 0.5
-"""Peaks from which delays are certain enough to accuse the array of not fitting them."""
-MISFIT = 20.0
-"""Sigmas. One far source gives about 1, two sources or an echo up to some 10."""
+"""Median peak from which delays are certain enough to accuse the array of not fitting them; a single
+pair may have none, where its delay is longer than its microphones' places allow."""
+MISFIT = 10.0
+"""Sigmas. One far source with strong peaks gives about 1; microphones of a square swapped, 17 to 110."""
 
 
 def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearing) -> set[str]:
@@ -62,7 +63,12 @@ def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearin
         for j in live[k + 1 :]:
             if np.abs(samples[i] - samples[j]).max() <= SAME * magnitude[i].max():
                 found.add(f"microphones {i} and {j}: the same signal twice, check audio.channel_map")
-    if not dead and not broken and tdoa.peak.min() > STRONG_PEAK and bearing.misfit > MISFIT:
+    if (
+        not dead
+        and not broken
+        and np.sort(tdoa.peak)[len(tdoa.peak) // 2] > STRONG_PEAK
+        and bearing.misfit > MISFIT
+    ):
         found.add("the delays fit no direction: channels swapped, or array.positions_m is wrong")
     return found
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import logging
+import math
 import re
 import threading
 import time
@@ -35,7 +36,7 @@ from locagen_edge.types import Array, Frame
 log = logging.getLogger(__name__)
 
 POLL_S = 0.02  # 50 wake-ups a second; less than half the default hop
-LATENCY_S = 0.2  # the card's buffer: what may pile up while this process does not get to run
+LATENCY_S = 0.4  # the card's buffer: what may pile up while this process does not get to run; delays nothing
 LOSS_S = 0.05  # more than the coarsest pointer of a USB card moves at once (a few ms to 20 ms)
 LOSS_POLLS = 10  # a late pointer recovers within a poll or two; sound that is lost stays lost
 DRIFT_POLLS = 500  # 10 s: jitter averages out, and 100 ppm of clock error lag by 1 ms
@@ -108,12 +109,14 @@ async def alsa(settings: Settings) -> AsyncGenerator[Frame, None]:
     global _hung
     if _hung is not None and _hung.is_alive():
         raise SourceHungError(f"{_label(settings)}: the driver still hangs: restart the service")
-    box = _Mailbox(asyncio.get_running_loop(), settings.daemon.queue_frames)
+    # A process that did not get to run for a while finds the card's whole buffer waiting: no loss yet.
+    at_once = math.ceil(LATENCY_S / settings.hop_s)
+    box = _Mailbox(asyncio.get_running_loop(), settings.daemon.queue_frames + at_once)
     stop = threading.Event()
     # A daemon thread: one that hangs in a driver must not keep the process from ending.
     thread = threading.Thread(target=_capture_into, args=(box, settings, stop), name="capture", daemon=True)
     thread.start()
-    patience_s = OPEN_S
+    patience_s = OPEN_S + settings.daemon.stall_s
     try:
         while True:
             try:

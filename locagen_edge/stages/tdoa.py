@@ -6,12 +6,15 @@ and a band up to 0.94 of Nyquist the parabola's own bias is below 1e-4 samples.
 Sigma. The correlation's slope at the true delay is (1/K) sum_k w_k sin(phi_k), where phi_k is the phase
 noise of bin k; the delay's error is that slope over the curvature r''. With E[sin^2 phi] = (1 - E[cos 2 phi])
 / 2 and wrapped-normal phases, for which E[cos 2 phi] = (E[cos phi])^4 (Mardia & Jupp, *Directional
-Statistics*, section 3.5), and with the peak height p standing for E[cos phi]:
+Statistics*, section 3.5), and with the relative peak height p standing for E[cos phi]:
 
     sigma = sqrt(RHO * mean(w^2) * (1 - p^4) / (2 K)) / |r''|
 
 RHO counts that the Hann window correlates neighbouring bins (2/3 and 1/6 in amplitude): 1 + 2 (4/9 + 1/36).
-r'' is the measured curvature, so that a sound which fills only part of the band gets its wider sigma.
+r'' is the measured curvature, so that a sound which fills only part of the band gets its wider sigma. p is
+relative to what a coherent noise-like sound reaches, which the relative floor keeps below 1: a bin of
+exponentially distributed power x counts x / (x + floor). Sounds with emptier spectra reach less, and get a
+sigma on the wide side.
 """
 
 from __future__ import annotations
@@ -25,6 +28,9 @@ from locagen_edge.settings import CorrelationSettings
 from locagen_edge.types import F64, Correlation, Tdoa
 
 RHO = 1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0)
+
+LEAST_NOISE = 4e-3
+"""30 dB SNR: above it the peak differs from 1 by no more than it does from frame to frame."""
 
 LEAST_PEAK = 1e-3
 """Below this there is no peak but rounding: with 450 bins of pure noise the highest is about 0.1."""
@@ -40,6 +46,9 @@ class PeakPicker:
         bins = np.arange(math.ceil(low * frame / rate_hz), math.floor(high * frame / rate_hz) + 1)
         omega = 2.0 * np.pi * bins * rate_hz / frame
         self._slope_noise = math.sqrt(RHO * float(np.mean(omega**2)) / (2.0 * len(bins)))
+        share = (np.arange(4096) + 0.5) / 4096
+        power = -np.log(share)
+        self._full_peak = float(np.mean(power / (power + 10 ** (settings.relative_floor_db / 10))))
         self._step_s = 1.0 / (settings.oversample * rate_hz)
         self._limit_s = array.spacing_m / speed_m_s
         self._outside: np.ndarray | None = None
@@ -66,7 +75,8 @@ class PeakPicker:
         shift = np.clip((right - left) / (2.0 * bend), -1.0, 1.0)
         peak = np.clip(top + (right - left) * shift / 4.0, 0.0, 1.0)
         curvature = bend / self._step_s**2
-        noise = np.sqrt(np.maximum(1.0 - peak**4, 1e-6))  # 1e-6: float32 phases, about 1e-3 rad
+        coherence = np.minimum(peak / self._full_peak, 1.0)
+        noise = np.sqrt(np.maximum(1.0 - coherence**4, LEAST_NOISE))
         sigma = self._slope_noise * noise / curvature
         return Tdoa(
             delay_s=np.where(good, correlation.lag_s[best] + shift * self._step_s, np.nan),

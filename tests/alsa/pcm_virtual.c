@@ -111,9 +111,8 @@ static snd_pcm_sframes_t card_pointer(snd_pcm_ioplug_t *io)
 	uint64_t made =
 		(uint64_t)((double)(now_ns() - card->started_ns) * 1e-9 * card->rate * (1.0 + 1e-6 * card->control->ppm));
 	uint64_t skip = card->control->skip;
-	card->made = made > skip ? made - skip : 0;
-	if (card->made < card->read)
-		card->made = card->read; /* just skipped: stand until the clock has caught up */
+	if (made > card->made + skip)
+		card->made = made - skip; /* else just skipped: a pointer stands, and never goes back */
 	if (card->made - card->read > io->buffer_size)
 		return -EPIPE;
 	return (snd_pcm_sframes_t)(card->made % io->buffer_size);

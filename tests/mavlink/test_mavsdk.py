@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import importlib.util
-import json
 import math
 import socket
-import sys
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
+from peers import WITHIN_S, Peer, free_port, mavsdk
 
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.link import Link, parse
@@ -26,7 +23,6 @@ pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("mavsdk") is None, reason="needs the mavsdk package (extra: dev)"
 )
 
-WITHIN_S = 20.0  # far above what anything here takes; it bounds a test that fails
 QUIET = Status(hearing=True, track=None, snr_db=0.0, faults=())
 CALLING = Status(
     hearing=True,
@@ -36,51 +32,6 @@ CALLING = Status(
     heading_rad=math.radians(100.0),
 )
 WANTED = {"LG_AZB": 287.75, "LG_AZ": 27.75, "LG_EL": -20.0, "LG_SIG": 3.25, "LG_CONF": 0.875, "LG_SNR": 6.5}
-
-
-class Peer:
-    """What the other process says."""
-
-    def __init__(self, process: asyncio.subprocess.Process) -> None:
-        self._process = process
-        self.heard: list[dict[str, Any]] = []
-
-    async def until(self, condition: Callable[[list[dict[str, Any]]], Any]) -> Any:
-        assert self._process.stdout
-        async with asyncio.timeout(WITHIN_S):
-            while not (found := condition(self.heard)):
-                line = await self._process.stdout.readline()
-                assert line, "the peer has ended"
-                self.heard.append(json.loads(line))
-        return found
-
-    def messages(self, name: str) -> list[dict[str, Any]]:
-        return [message for message in self.heard if message.get("name") == name]
-
-
-@asynccontextmanager
-async def mavsdk(role: str, url: str) -> AsyncIterator[Peer]:
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        str(Path(__file__).with_name("mavsdk_peer.py")),
-        role,
-        url,
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.DEVNULL,
-    )
-    peer = Peer(process)
-    try:
-        await peer.until(lambda heard: heard and heard[0].get("open"))
-        yield peer
-    finally:
-        assert process.stdin
-        process.stdin.close()
-        try:
-            await asyncio.wait_for(process.wait(), 2.0)
-        except TimeoutError:
-            process.kill()
-            await process.wait()
 
 
 class Daemon:
@@ -117,12 +68,6 @@ async def daemon(text: str) -> AsyncIterator[Daemon]:
     finally:
         task.cancel()
         await asyncio.wait({task})
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 async def check(ground: Peer, daemon: Daemon, system: int) -> None:

@@ -1,0 +1,343 @@
+/* test_kernel.c - the kernel's laws in C, for the sanitizers and for CPUs without Python.
+ *
+ * Needs nothing but libm. Every configuration runs in memory of exactly the size asked for, at an odd
+ * address, its outputs exactly sized too, and once for each vector width that this CPU has; the narrow
+ * one is what flies. Prints what failed and one line at the end.
+ */
+#include "gcc_phat.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+static int passed, failed;
+
+#define CHECK(condition, ...)                                                                                \
+    do {                                                                                                     \
+        if (condition) {                                                                                     \
+            passed++;                                                                                        \
+        } else {                                                                                             \
+            failed++;                                                                                        \
+            printf("%s:%d: %s: ", __FILE__, __LINE__, #condition);                                           \
+            printf(__VA_ARGS__);                                                                             \
+            printf("\n");                                                                                    \
+        }                                                                                                    \
+    } while (0)
+
+typedef int (*path)(const state *, const float *, float *, float *);
+
+static path paths[2] = {locagen_frame_quad};
+static int path_count = 1;
+
+static const locagen_gcc_config TRIANGLE = {
+    .mics = 3, .frame = 1024, .lags = 63, .oversample = 16, .rate_hz = 10000.0f, .band_low_hz = 300.0f,
+    .band_high_hz = 4700.0f, .floor = 1e-12f, .relative_floor = 1e-3f,
+};
+
+/* xorshift (Marsaglia 2003): the same numbers everywhere. Uniform, -0.5 to 0.5. */
+static uint32_t seed = 1;
+static float uniform(void)
+{
+    seed ^= seed << 13;
+    seed ^= seed >> 17;
+    seed ^= seed << 5;
+    return (float)(seed >> 8) / 16777216.0f - 0.5f;
+}
+
+static void *allocate(size_t bytes)
+{
+    void *p = malloc(bytes);
+    if (p == NULL) {
+        printf("out of memory\n");
+        exit(2);
+    }
+    return p;
+}
+
+/* A kernel with everything around it, each block its own: a sanitizer sees one byte too far. */
+typedef struct {
+    locagen_gcc_config config;
+    char *memory;
+    locagen_gcc *kernel;
+    int pairs, columns;
+    float *in, *correlation, *power;
+} bench;
+
+static bench set_up(locagen_gcc_config config, path chosen)
+{
+    enum { MISALIGNED = 3 };
+    bench b = {.config = config, .columns = 2 * config.lags + 1};
+    b.pairs = config.mics * (config.mics - 1) / 2;
+    size_t bytes = locagen_gcc_sizeof(&config);
+    b.memory = allocate(bytes + MISALIGNED);
+    memset(b.memory, 0xA5, bytes + MISALIGNED);
+    b.kernel = (locagen_gcc *)(b.memory + MISALIGNED);
+    int code = locagen_gcc_init(b.kernel, &config);
+    CHECK(code == 0, "init gave %d", code);
+    CHECK(memcmp(b.memory, "\xA5\xA5\xA5", MISALIGNED) == 0, "init wrote before its memory");
+    ((state *)(((uintptr_t)b.kernel + 63) & ~(uintptr_t)63))->frame = chosen;
+    b.in = allocate(sizeof(float) * (size_t)(config.mics * config.frame));
+    b.correlation = allocate(sizeof(float) * (size_t)(b.pairs * b.columns));
+    b.power = allocate(sizeof(float) * (size_t)config.mics);
+    for (int n = 0; n < config.mics * config.frame; n++)
+        b.in[n] = uniform();
+    return b;
+}
+
+static void tear_down(bench *b)
+{
+    free(b->memory);
+    free(b->in);
+    free(b->correlation);
+    free(b->power);
+}
+
+static int run(bench *b)
+{
+    for (int n = 0; n < b->pairs * b->columns; n++)
+        b->correlation[n] = NAN;
+    for (int m = 0; m < b->config.mics; m++)
+        b->power[m] = NAN;
+    return locagen_gcc_process(b->kernel, b->in, b->correlation, b->power);
+}
+
+/* The definition, in double and without an FFT. Returns the largest error as a share of its pair's peak. */
+static double error_of(const bench *b)
+{
+    const locagen_gcc_config *c = &b->config;
+    const double two_pi = 6.283185307179586;
+    int first = (int)ceil(c->band_low_hz * (double)c->frame / c->rate_hz);
+    int last = (int)floor(c->band_high_hz * (double)c->frame / c->rate_hz);
+    int bins = last - first + 1;
+    double *re = allocate(sizeof(double) * (size_t)(c->mics * bins));
+    double *im = allocate(sizeof(double) * (size_t)(c->mics * bins));
+    double *turn = allocate(sizeof(double) * (size_t)c->frame);
+    double worst = 0;
+    for (int n = 0; n < c->frame; n++)
+        turn[n] = cos(two_pi * n / c->frame);
+    for (int m = 0; m < c->mics; m++) {
+        double power = 0;
+        for (int k = 0; k < bins; k++) {
+            double r = 0, i = 0;
+            for (int n = 0; n < c->frame; n++) {
+                int at = (int)((long)(first + k) * n % c->frame);
+                double x = b->in[m * c->frame + n] * (0.5 - 0.5 * turn[n]);
+                r += x * turn[at];
+                i -= x * turn[(at + 3 * c->frame / 4) % c->frame];
+            }
+            double gain = sqrt(2 / (0.375 * c->frame * c->frame));
+            re[m * bins + k] = r * gain, im[m * bins + k] = i * gain;
+            power += gain * gain * (r * r + i * i);
+        }
+        double off = fabs(b->power[m] - power) / power;
+        worst = off > worst ? off : worst;
+        double floor = fmax(c->floor, c->relative_floor * power / bins);
+        for (int at = m * bins; at < (m + 1) * bins; at++) {
+            double scale = 1 / sqrt(re[at] * re[at] + im[at] * im[at] + floor);
+            re[at] *= scale, im[at] *= scale;
+        }
+    }
+    const float *row = b->correlation;
+    for (int i = 0; i < c->mics; i++)
+        for (int j = i + 1; j < c->mics; j++, row += b->columns) {
+            double peak = 0, off = 0;
+            for (int l = -c->lags; l <= c->lags; l++) {
+                double sum = 0;
+                for (int k = 0; k < bins; k++) {
+                    int x = i * bins + k, y = j * bins + k;
+                    double angle = two_pi * (first + k) * l / ((double)c->frame * c->oversample);
+                    sum += (re[y] * re[x] + im[y] * im[x]) * cos(angle);
+                    sum -= (im[y] * re[x] - re[y] * im[x]) * sin(angle);
+                }
+                peak = fmax(peak, fabs(sum / bins));
+                double distance = fabs(row[l + c->lags] - sum / bins);
+                off = distance <= off ? off : distance; /* NaN is kept */
+            }
+            worst = off / peak <= worst ? worst : off / peak;
+        }
+    free(re);
+    free(im);
+    free(turn);
+    return worst;
+}
+
+static void test_reference(path chosen)
+{
+    /* mics, frame, lags, oversample, low, high: all group sizes, both parities of the band's edges, blocks of
+     * lags that just fit and just do not, every bin (no thinning), a single coarse bin. */
+    static const struct {
+        int mics, frame, lags, oversample;
+        float low, high;
+    } cases[] = {
+        {3, 1024, 63, 16, 300, 4700},  {2, 256, 1, 1, 300, 4700},     {4, 512, 64, 16, 310, 4690},
+        {5, 256, 62, 3, 20, 4979},     {6, 256, 190, 16, 1000, 2000}, {7, 512, 191, 7, 2500, 4000},
+        {8, 1024, 63, 16, 300, 4700},  {8, 256, 63, 1, 300, 4700},    {2, 2048, 16, 64, 3000, 3100},
+        {3, 4096, 63, 16, 300, 1200},  {3, 512, 127, 1, 20, 4990},    {2, 256, 1, 64, 2000, 2400},
+        {3, 256, 4095, 64, 300, 4700}, {4, 1024, 900, 16, 4000, 4990},
+    };
+    for (size_t n = 0; n < sizeof cases / sizeof *cases; n++) {
+        locagen_gcc_config config = TRIANGLE;
+        config.mics = cases[n].mics, config.frame = cases[n].frame, config.lags = cases[n].lags;
+        config.oversample = cases[n].oversample;
+        config.band_low_hz = cases[n].low, config.band_high_hz = cases[n].high;
+        bench b = set_up(config, chosen);
+        int bad = run(&b);
+        CHECK(bad == 0, "case %zu: mask %d", n, bad);
+        double error = error_of(&b);
+        CHECK(error < 1e-4, "case %zu: error %.2e of the peak", n, error);
+        tear_down(&b);
+    }
+}
+
+static void test_sign(path chosen)
+{
+    locagen_gcc_config config = TRIANGLE;
+    config.mics = 2, config.lags = 160;
+    for (int delay = -7; delay <= 7; delay += 14) {
+        bench b = set_up(config, chosen);
+        for (int n = 7; n < 1024 - 7; n++)
+            b.in[1024 + n + (delay > 0 ? delay : 0)] = b.in[n + (delay < 0 ? -delay : 0)];
+        run(&b);
+        int peak = 0;
+        for (int l = 1; l < b.columns; l++)
+            if (b.correlation[l] > b.correlation[peak])
+                peak = l;
+        CHECK(peak - 160 == 16 * delay, "delay %d samples, peak at lag %d / 16", delay, peak - 160);
+        tear_down(&b);
+    }
+}
+
+static void test_faulty_channels(path chosen)
+{
+    static const float faults[] = {NAN, INFINITY, -INFINITY, 1e30f, 3e38f, 0.0f};
+    for (int mics = 2; mics <= 8; mics++)
+        for (size_t fault = 0; fault < sizeof faults / sizeof *faults; fault++) {
+            locagen_gcc_config config = TRIANGLE;
+            config.mics = mics, config.frame = 512;
+            bench b = set_up(config, chosen);
+            int faulty = (int)fault % mics;
+            size_t bytes = sizeof(float) * (size_t)(b.pairs * b.columns);
+            float *healthy = allocate(bytes);
+            run(&b);
+            memcpy(healthy, b.correlation, bytes);
+            for (int n = 0; n < 512; n++)
+                if (n == 99 || faults[fault] == 0.0f)
+                    b.in[faulty * 512 + n] = faults[fault];
+            int bad = run(&b);
+            int expected = faults[fault] == 0.0f ? 0 : 1 << faulty;
+            CHECK(bad == expected, "%d mics, fault %zu: mask %d", mics, fault, bad);
+            CHECK(b.power[faulty] == 0.0f, "power %g", (double)b.power[faulty]);
+            int row = 0, wrong = 0;
+            for (int i = 0; i < mics; i++)
+                for (int j = i + 1; j < mics; j++, row++)
+                    for (int l = row * b.columns; l < (row + 1) * b.columns; l++)
+                        wrong += b.correlation[l] != (i == faulty || j == faulty ? 0.0f : healthy[l]);
+            CHECK(wrong == 0, "%d mics, fault %zu: %d values differ", mics, fault, wrong);
+            free(healthy);
+            tear_down(&b);
+        }
+}
+
+static void test_silence(path chosen)
+{
+    for (int with_floor = 0; with_floor < 2; with_floor++) {
+        locagen_gcc_config config = TRIANGLE;
+        config.mics = 8;
+        if (!with_floor)
+            config.floor = config.relative_floor = 0.0f;
+        bench b = set_up(config, chosen);
+        memset(b.in, 0, sizeof(float) * 8 * 1024);
+        CHECK(run(&b) == 0, "silence is finite");
+        int wrong = 0;
+        for (int n = 0; n < b.pairs * b.columns; n++)
+            wrong += b.correlation[n] != 0.0f;
+        CHECK(wrong == 0, "%d values are not zero", wrong);
+        tear_down(&b);
+    }
+}
+
+static void test_paths_agree(void)
+{
+    bench b = set_up(TRIANGLE, paths[0]);
+    run(&b);
+    float narrow[3 * 127];
+    memcpy(narrow, b.correlation, sizeof narrow);
+    ((state *)(((uintptr_t)b.kernel + 63) & ~(uintptr_t)63))->frame = paths[path_count - 1];
+    run(&b);
+    float worst = 0.0f;
+    for (int n = 0; n < 3 * 127; n++)
+        worst = fmaxf(worst, fabsf(b.correlation[n] - narrow[n]));
+    CHECK(worst < 1e-6f, "the widths differ by %g", (double)worst); /* rounding of values around 0.1 */
+    tear_down(&b);
+}
+
+static void refused(locagen_gcc_config config, int expected, const char *what)
+{
+    char room[1] = {0};
+    CHECK(locagen_gcc_sizeof(&config) == 0, "%s", what);
+    int code = locagen_gcc_init((locagen_gcc *)room, &config);
+    CHECK(code == expected, "%s: %d (%s)", what, code, locagen_strerror(code));
+}
+
+static void test_refusals(void)
+{
+#define REFUSED(field, value, code)                                                                          \
+    do {                                                                                                     \
+        locagen_gcc_config config = TRIANGLE;                                                                \
+        config.field = value;                                                                                \
+        refused(config, code, #field " = " #value);                                                          \
+    } while (0)
+    REFUSED(mics, 1, LOCAGEN_E_MICS);
+    REFUSED(mics, 9, LOCAGEN_E_MICS);
+    REFUSED(mics, INT32_MIN, LOCAGEN_E_MICS);
+    REFUSED(frame, 128, LOCAGEN_E_FRAME);
+    REFUSED(frame, 1023, LOCAGEN_E_FRAME);
+    REFUSED(frame, 8192, LOCAGEN_E_FRAME);
+    REFUSED(rate_hz, 0.0f, LOCAGEN_E_RATE);
+    REFUSED(rate_hz, -INFINITY, LOCAGEN_E_RATE);
+    REFUSED(rate_hz, NAN, LOCAGEN_E_RATE);
+    REFUSED(band_low_hz, 0.0f, LOCAGEN_E_BAND);
+    REFUSED(band_low_hz, 4700.0f, LOCAGEN_E_BAND);
+    REFUSED(band_low_hz, 4640.0f, LOCAGEN_E_BAND);
+    REFUSED(band_high_hz, 5000.0f, LOCAGEN_E_BAND);
+    REFUSED(band_high_hz, NAN, LOCAGEN_E_BAND);
+    REFUSED(lags, 0, LOCAGEN_E_LAGS);
+    REFUSED(lags, 4096, LOCAGEN_E_LAGS);
+    REFUSED(lags, INT32_MAX, LOCAGEN_E_LAGS);
+    REFUSED(oversample, 0, LOCAGEN_E_LAGS);
+    REFUSED(oversample, 65, LOCAGEN_E_LAGS);
+    REFUSED(floor, -1e-9f, LOCAGEN_E_FLOOR);
+    REFUSED(floor, INFINITY, LOCAGEN_E_FLOOR);
+    REFUSED(relative_floor, 1.0f, LOCAGEN_E_FLOOR);
+    REFUSED(relative_floor, NAN, LOCAGEN_E_FLOOR);
+    CHECK(locagen_gcc_sizeof(NULL) == 0, "no configuration");
+    CHECK(locagen_gcc_init(NULL, &TRIANGLE) == LOCAGEN_E_NULL, "no memory");
+    bench b = set_up(TRIANGLE, paths[0]);
+    CHECK(locagen_gcc_init(b.kernel, NULL) == LOCAGEN_E_NULL, "no configuration");
+    CHECK(locagen_gcc_process(NULL, b.in, b.correlation, b.power) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_gcc_process(b.kernel, NULL, b.correlation, b.power) == LOCAGEN_E_NULL, "no input");
+    CHECK(locagen_gcc_process(b.kernel, b.in, NULL, b.power) == LOCAGEN_E_NULL, "no correlation");
+    CHECK(locagen_gcc_process(b.kernel, b.in, b.correlation, NULL) == LOCAGEN_E_NULL, "no power");
+    tear_down(&b);
+    for (int code = -8; code <= 1; code++)
+        CHECK(strlen(locagen_strerror(code)) > 5, "code %d", code);
+}
+
+int main(void)
+{
+#if defined(__x86_64__)
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+        paths[path_count++] = locagen_frame_avx2;
+#endif
+    for (int n = 0; n < path_count; n++) {
+        test_reference(paths[n]);
+        test_sign(paths[n]);
+        test_faulty_channels(paths[n]);
+        test_silence(paths[n]);
+    }
+    test_paths_agree();
+    test_refusals();
+    printf("%d passed, %d failed (vector widths: %d)\n", passed, failed, path_count);
+    return failed != 0;
+}

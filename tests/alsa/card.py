@@ -1,0 +1,92 @@
+"""Builds the virtual capture card (pcm_virtual.c), and holds its controls.
+
+`VirtualCard.play` runs a scenario of scenarios.py in a process of its own: ALSA and PortAudio read their
+configuration once, at their start.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+HERE = Path(__file__).parent
+ROWS = 65_521  # the ramp's period, a prime: it hides no repetition of blocks
+CHANNEL_STEP = 8191  # rows by which one channel's ramp is ahead of the one before
+
+
+def ramp(channels: int) -> np.ndarray:
+    """(ROWS, channels) int16: every sample tells its row and its channel."""
+    row = np.arange(ROWS)[:, np.newaxis] + CHANNEL_STEP * np.arange(channels)
+    return (row % ROWS - ROWS // 2).astype("<i2")
+
+
+def row_of(samples: np.ndarray, channel: int) -> np.ndarray:
+    """The row numbers, modulo ROWS, of samples of one channel at full scale 1.0."""
+    return (np.rint(np.asarray(samples) * 32768).astype(int) + ROWS // 2 - CHANNEL_STEP * channel) % ROWS
+
+
+def build(directory: Path) -> Path:
+    """The plugin, compiled. Skips the test where what it needs is not there."""
+    if ctypes.util.find_library("portaudio") is None:
+        pytest.skip("PortAudio is not installed (libportaudio2)")
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler to build the virtual sound card with")
+    library = directory / "libasound_module_pcm_virtual.so"
+    flags = ["-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-DPIC", "-shared"]
+    headers = "#include <alsa/asoundlib.h>\n#include <alsa/pcm_external.h>\n"
+    probe = subprocess.run(
+        [compiler, "-E", "-x", "c", "-"], input=headers, text=True, capture_output=True, check=False
+    )
+    if probe.returncode:
+        pytest.skip("ALSA's headers are not installed (libasound2-dev)")
+    subprocess.run([compiler, *flags, "-o", library, HERE / "pcm_virtual.c", "-lasound"], check=True)
+    return library
+
+
+class VirtualCard:
+    """A card named `name`, on a configuration of its own."""
+
+    def __init__(
+        self, library: Path, directory: Path, name: str = "array4", rate_hz: int = 10_000, real: bool = False
+    ) -> None:
+        self.directory = directory
+        rows = ramp(4)
+        if real:
+            (directory / "rows").write_bytes((rows / np.float32(32768)).astype("<f4").tobytes())
+        else:
+            (directory / "rows").write_bytes(rows.tobytes())
+        (directory / "control").write_bytes(bytes(4096))
+        (directory / "asound.conf").write_text(
+            "</usr/share/alsa/alsa.conf>\n"
+            f'pcm_type.virtual {{ lib "{library}" }}\n'
+            f'pcm.{name} {{ type virtual file "{directory}/rows" control "{directory}/control" '
+            f"channels 4 rate {rate_hz} float {int(real)} }}\n",
+            encoding="utf-8",
+        )
+
+    def play(self, scenario: str, **audio: object) -> dict:
+        """What the scenario found, run with these settings of [audio]."""
+        table = {
+            "audio": {
+                "source": "alsa", "device": "array", "device_rate_hz": 10_000, "device_channels": 4,
+                "channel_map": [2, 0, 3], **audio,
+            },
+            "daemon": {"stall_s": 0.3},
+        }  # fmt: skip
+        child = subprocess.run(
+            [sys.executable, "-W", "error", HERE / "scenarios.py", scenario],
+            input=json.dumps({"table": table, "control": str(self.directory / "control")}),
+            env=os.environ | {"ALSA_CONFIG_PATH": str(self.directory / "asound.conf")},
+            text=True, capture_output=True, timeout=60, check=False,
+        )  # fmt: skip
+        assert child.returncode == 0, child.stderr
+        return json.loads(child.stdout)

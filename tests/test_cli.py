@@ -1,0 +1,283 @@
+"""The command line as its user meets it: in a process of its own."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import pty
+import socket
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from conftest import ROOT
+from scenes import heard
+
+from locagen_edge.settings import Settings
+
+FIELDS = {"t_s", "azimuth_deg", "elevation_deg", "sigma_deg", "snr_db", "call", "estimator"}
+
+
+def cli(*arguments: str | Path, **more) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error", **more}
+    return subprocess.run(
+        [sys.executable, "-m", "locagen_edge", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment,
+        check=False,
+    )
+
+
+def fails(code: int, says: str, *arguments: str | Path) -> None:
+    """Ends with this code, with `says` in a text for people, one line per fault, on the error stream."""
+    done = cli(*arguments)
+    assert done.returncode == code, done.stderr
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+    if code == 1:
+        lines = [line for line in done.stderr.splitlines() if not line.startswith(("I ", "W "))]
+        assert all(line.startswith("locagen-edge: ") for line in lines), done.stderr
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """Two seconds of a caller at 57 degrees, 20 dB, 16 bit, 10 kHz, three channels."""
+    path = tmp_path_factory.mktemp("wav") / "call.wav"
+    samples = heard(Settings(), np.radians(57.0), -0.3, 20.0, 20_000)
+    soundfile.write(path, samples.T, 10_000, subtype="PCM_16")
+    return path
+
+
+# --- help and usage
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["replay"], ["devices"], ["check"]])
+def test_help_is_there(command):
+    done = cli(*command, "--help")
+    assert done.returncode == 0
+    assert "usage: locagen-edge" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly"],
+        ["replay"],
+        ["run", "--seconds", "0"],
+        ["run", "--seconds", "x"],
+        ["replay", "a", "--format", "xml"],
+    ],
+)
+def test_wrong_usage_is_exit_code_2(arguments):
+    fails(2, "usage:", *arguments)
+
+
+def test_the_version_is_the_packages():
+    from locagen_edge import __version__
+
+    assert cli("--version").stdout == f"locagen-edge {__version__}\n"
+
+
+# --- replay
+
+
+def test_replay_gives_a_json_line_per_hop(recording):
+    done = cli("replay", recording)
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(lines) == (20_000 - 1024) // 512 + 1
+    for number, line in enumerate(lines):
+        assert line.keys() >= FIELDS
+        assert line["t_s"] == pytest.approx(number * 0.0512)
+        assert line["azimuth_deg"] == pytest.approx(57.0, abs=2.0)
+        assert line["estimator"] == "far-field"
+        assert isinstance(line["call"], bool)
+
+
+def test_replay_gives_a_table_too(recording):
+    done = cli("replay", recording, "--format", "table")
+    head, *rows = done.stdout.splitlines()
+    assert set(head.split()) >= FIELDS
+    column = head.split().index("azimuth_deg")
+    assert all(float(row.split()[column]) == pytest.approx(57.0, abs=2.0) for row in rows)
+    assert all(len(row) >= head.rindex("estimator") for row in rows)
+
+
+def test_replay_obeys_the_settings(recording, tmp_path):
+    settings = tmp_path / "s.toml"
+    settings.write_text('[audio]\nchannel_map = [1, 2, 0]\nhop = 1024\n[bearing]\nestimator = "hyperbolic"\n')
+    lines = [
+        json.loads(line) for line in cli("replay", recording, "--settings", settings).stdout.splitlines()
+    ]
+    assert {line["estimator"] for line in lines} == {"hyperbolic"}
+    assert lines[1]["t_s"] == pytest.approx(0.1024)
+    # channels turned round by one: the bearing turns by a third
+    assert np.median([line["azimuth_deg"] for line in lines]) == pytest.approx(57.0 - 120.0 + 360.0, abs=3.0)
+
+
+def test_replay_ends_quietly_when_its_reader_does(recording):
+    command = f"{sys.executable} -m locagen_edge replay {recording} | head -1"
+    done = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", command],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Error" not in done.stderr
+    assert len(done.stdout.splitlines()) == 1
+
+
+def test_replay_shows_progress_on_a_terminal_and_nowhere_else(recording, tmp_path):
+    leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    with (tmp_path / "out").open("w") as out:
+        subprocess.run(
+            [sys.executable, "-m", "locagen_edge", "replay", str(recording)],
+            stdout=out,
+            stderr=follower,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            timeout=60,
+            check=True,
+        )
+    os.close(follower)
+    shown = os.read(leader, 65536).decode()
+    os.close(leader)
+    assert "100%" in shown
+    assert "of sound" in shown
+    assert "%" not in cli("replay", recording).stderr
+
+
+def test_silence_replays_as_null(tmp_path):
+    path = tmp_path / "silence.wav"
+    soundfile.write(path, np.zeros((20_000, 3)), 10_000)
+    lines = [json.loads(line) for line in cli("replay", path).stdout.splitlines()]
+    assert {line["azimuth_deg"] for line in lines} == {None}
+    assert lines[-1]["faults"] == ["no microphone hears anything"]
+
+
+def test_bad_files_are_told_in_one_line(tmp_path):
+    missing = tmp_path / "missing.wav"
+    fails(1, "missing.wav: there is no such file", "replay", missing)
+    empty = tmp_path / "empty.wav"
+    empty.touch()
+    fails(1, "empty.wav: is empty", "replay", empty)
+    text = tmp_path / "text.wav"
+    text.write_text("this is not a recording, but somebody's notes\n" * 100)
+    fails(1, "text.wav: is not audio", "replay", text)
+    stereo = tmp_path / "stereo.wav"
+    soundfile.write(stereo, np.zeros((20_000, 2)), 10_000)
+    fails(1, "stereo.wav: has 2 channels, but audio.channel_map names channel 2", "replay", stereo)
+    slow = tmp_path / "slow.wav"
+    soundfile.write(slow, np.zeros((20_000, 3)), 8_000)
+    fails(1, "8000 Hz carries sound up to 4000 Hz", "replay", slow)
+    short = tmp_path / "short.wav"
+    soundfile.write(short, np.zeros((500, 3)), 10_000)
+    fails(1, "less than one frame", "replay", short)
+
+
+def test_a_recording_that_is_cut_short_is_used_as_far_as_it_goes(recording, tmp_path):
+    cut = tmp_path / "cut.wav"
+    cut.write_bytes(recording.read_bytes()[: recording.stat().st_size // 2])
+    done = cli("replay", cut)
+    assert done.returncode == 0, done.stderr
+    assert "cut short" in done.stderr
+    assert 15 < len(done.stdout.splitlines()) < 20
+
+
+# --- settings
+
+
+def test_bad_settings_are_told_all_at_once(tmp_path):
+    path = tmp_path / "bad.toml"
+    path.write_text("[audio]\nframe = 1000\nhopp = 3\n[bearing]\nestimator = 'guess'\n")
+    for command in (["run"], ["replay", "x.wav"], ["check"]):
+        done = cli(*command, "--settings", path)
+        assert done.returncode == 1
+        lines = done.stderr.splitlines()
+        assert [line.split(":")[1].strip() for line in lines] == [
+            "audio.hopp",
+            "bearing.estimator",
+            "audio.frame",
+        ]
+
+
+def test_missing_settings_and_models_are_told(tmp_path):
+    fails(1, "nowhere.toml: cannot be read", "run", "--settings", tmp_path / "nowhere.toml")
+    path = tmp_path / "model.toml"
+    path.write_text('[bearing]\nestimator = "model:nope"\n')
+    fails(1, "model nope: is not in", "run", "--settings", path)
+
+
+# --- check
+
+
+def test_check_finds_all_well_with_the_default_scene():
+    done = cli("check", "--seconds", "0.5", "--settings", ROOT / "systemd" / "locagen-edge.toml")
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = [line.split(":")[0] for line in done.stdout.splitlines()]
+    assert [line.split()[0] for line in found] == ["ok"] * len(found)
+    assert {line.split()[1] for line in found} == {"settings", "models", "estimator", "microphones", "link"}
+
+
+def test_check_says_what_is_wrong_and_exits_with_1(tmp_path):
+    path = tmp_path / "dead.wav"
+    samples = heard(Settings(), 1.0, -0.3, 20.0, 40_000)
+    samples[1] = 0.0
+    soundfile.write(path, samples.T, 10_000)
+    settings = tmp_path / "s.toml"
+    settings.write_text(
+        f'[audio]\nsource = "wav"\nfile = "{path}"\n[mavlink]\nlink = "serial:{tmp_path}/ttyNONE:57600"\n'
+    )
+    done = cli("check", "--seconds", "3", "--settings", settings)
+    assert done.returncode == 1
+    wrong = [line for line in done.stdout.splitlines() if line.startswith("WRONG")]
+    assert any("microphones: microphone 1: dead" in line for line in wrong), done.stdout
+    assert any("link:" in line and "ttyNONE" in done.stdout for line in wrong), done.stdout
+
+
+# --- devices
+
+
+def test_devices_lists_or_says_why_not():
+    done = cli("devices")
+    assert "Traceback" not in done.stderr
+    if done.returncode == 0:
+        assert done.stdout
+    else:
+        assert "PortAudio" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("link", "says"),
+    [
+        ("udpout:127.0.0.1:99999", "port '99999' is not a number from 1 to 65535"),
+        ("tcp:127.0.0.1:0", "port '0'"),
+    ],
+)
+def test_a_port_that_cannot_be_is_refused_in_one_line(tmp_path, link, says):
+    path = tmp_path / "s.toml"
+    path.write_text(f'[mavlink]\nlink = "{link}"\n')
+    fails(1, says, "run", "--settings", path)
+
+
+def test_a_port_that_is_taken_is_told_while_the_daemon_goes_on(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        path = tmp_path / "s.toml"
+        path.write_text(f'[mavlink]\nlink = "udpin:127.0.0.1:{taken.getsockname()[1]}"\n')
+        done = cli("run", "--seconds", "1.5", "--settings", path)
+    assert done.returncode == 0, done.stderr
+    assert "down: Address already in use" in done.stderr
+    assert "link down: Address already in use" in done.stdout

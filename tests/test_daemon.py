@@ -1,0 +1,392 @@
+"""The daemon, with real sockets and sources that behave and misbehave."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager
+from itertools import count
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from peers import WITHIN_S, free_port, mavsdk
+from scenes import cut, heard
+
+from locagen_edge.daemon import Daemon
+from locagen_edge.errors import ModelError, SourceError, SourceHungError
+from locagen_edge.geometry import wrap
+from locagen_edge.mavlink import dialect
+from locagen_edge.mavlink.framer import Framer
+from locagen_edge.settings import Settings, from_table
+from locagen_edge.types import Frame
+
+Sources = Callable[[Settings], AsyncGenerator[Frame, None]]
+
+
+def with_link(port: int, **sections) -> Settings:
+    return from_table({"mavlink": {"link": f"udpout:127.0.0.1:{port}"}, **sections})
+
+
+@asynccontextmanager
+async def running(settings: Settings, **arguments) -> AsyncGenerator[Daemon, None]:
+    daemon = Daemon(settings, **arguments)
+    await daemon.startup()
+    main = asyncio.create_task(daemon.main_loop())
+    try:
+        yield daemon
+    finally:
+        daemon.stop()
+        await asyncio.gather(main, return_exceptions=True)
+        await daemon.shutdown()
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(WITHIN_S):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+def steady(settings: Settings, seconds: float = 1.0) -> list[Frame]:
+    return cut(settings, heard(settings, 1.0, -0.3, 20.0, round(seconds * settings.audio.rate_hz)))
+
+
+def source(settings: Settings, *, pace_s: float = 0.01, fail_after: int | None = None) -> Sources:
+    """Endless sound, faster than real time; fails after so many frames each time it is opened."""
+    frames = steady(settings)
+
+    async def frames_from(_: Settings) -> AsyncGenerator[Frame, None]:
+        for number in count():
+            if fail_after is not None and number >= fail_after:
+                raise SourceError("the cable is out")
+            frame = frames[number % len(frames)]
+            yield Frame(frame.samples, frame.rate_hz, time.monotonic_ns() - 102_400_000, frame.start)
+            await asyncio.sleep(pace_s)
+
+    return frames_from
+
+
+def messages(server: socket.socket) -> list:
+    """All that has arrived, decoded."""
+    framer, found = Framer(), []
+    server.setblocking(False)
+    while True:
+        try:
+            found += [dialect.decode(packet.raw) for packet in framer.feed(server.recv(2048))]
+        except BlockingIOError:
+            return found
+
+
+@pytest.fixture
+def ground() -> socket.socket:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind(("127.0.0.1", 0))
+        yield server
+
+
+def port_of(server: socket.socket) -> int:
+    return int(server.getsockname()[1])
+
+
+# --- the way
+
+
+def test_sound_goes_in_and_a_bearing_comes_out(ground):
+    settings = with_link(port_of(ground), detection={"snr_db": -20})
+
+    async def call_after_noise(_: Settings) -> AsyncGenerator[Frame, None]:
+        quiet = 1e-4 * np.random.default_rng(0).standard_normal((3, 1024)).astype(np.float32)
+        frames = [Frame(quiet, 10_000.0, 0, 0)] * 5 + steady(settings)
+        for number in count():
+            frame = frames[min(number, len(frames) - 1)]
+            yield Frame(frame.samples, frame.rate_hz, number * 51_200_000, number * 512)
+            await asyncio.sleep(0.02)
+
+    async def test() -> None:
+        async with running(settings, sources=call_after_noise) as daemon:
+            await until(lambda: daemon.component.sent["STATUSTEXT"] and daemon.component.sent["LG_AZB"] > 2)
+            assert daemon.estimate is not None
+            assert abs(wrap(daemon.estimate.track.azimuth_rad - 1.0)) < math.radians(2)
+            assert daemon.counters.dropped == 0
+
+    asyncio.run(test())
+    arrived = messages(ground)
+    values = [m.value for m in arrived if m.get_type() == "NAMED_VALUE_FLOAT" and m.name == "LG_AZB"]
+    assert values
+    assert values[-1] == pytest.approx(math.degrees(1.0), abs=2.0)
+    assert any(m.get_type() == "HEARTBEAT" and m.system_status == 4 for m in arrived)
+
+
+def test_a_pipeline_that_is_too_slow_drops_the_oldest_and_counts():
+    settings = with_link(9, daemon={"queue_frames": 2})
+
+    async def test() -> None:
+        async with running(settings, sources=source(settings, pace_s=0.001)) as daemon:
+            await until(lambda: daemon.counters.estimates > 3)
+            process, seen = daemon.pipeline.process, []
+
+            def slow(frame: Frame):
+                time.sleep(0.03)
+                seen.append(frame.t_ns)
+                return process(frame)
+
+            daemon.pipeline.process = slow
+            await until(lambda: daemon.counters.dropped > 20)
+            c = daemon.counters
+            assert 0 <= c.frames - c.dropped - c.estimates <= 2 + 2  # in the queue, or in hand
+            assert seen == sorted(seen)
+
+    asyncio.run(test())
+
+
+# --- what fails is opened again while the rest goes on
+
+
+def test_a_failing_source_is_reopened_and_told_while_the_link_goes_on(ground):
+    settings = with_link(port_of(ground), daemon={"stall_s": 0.2, "backoff_s": 0.6})
+
+    async def test() -> None:
+        async with running(settings, sources=source(settings, fail_after=5)) as daemon:
+            await until(lambda: daemon.source_fault)
+            await until(lambda: not daemon.hearing)
+            before = daemon.component.sent["HEARTBEAT"]
+            assert daemon.link.up
+            await until(lambda: daemon.counters.source_failures >= 3)
+            assert daemon.counters.frames >= 10
+            assert daemon.component.sent["HEARTBEAT"] - before <= 3  # only in the moments when it heard
+
+    asyncio.run(test())
+    assert any("the cable is out" in m.text for m in messages(ground) if m.get_type() == "STATUSTEXT")
+
+
+def test_a_source_that_never_opens_is_tried_again_with_growing_pauses(ground):
+    settings = with_link(port_of(ground), daemon={"stall_s": 0.2, "backoff_s": 0.8})
+    opened: list[float] = []
+
+    async def absent(_: Settings) -> AsyncGenerator[Frame, None]:
+        opened.append(time.monotonic())
+        raise SourceError("no such device")
+        yield  # makes it a generator
+
+    async def test() -> None:
+        async with running(settings, sources=absent) as daemon:
+            await until(lambda: len(opened) >= 4)
+            assert daemon.component.sent["HEARTBEAT"] == 0  # a daemon that does not hear shows no life
+
+    asyncio.run(test())
+    pauses = np.diff(opened)
+    assert pauses[0] >= 0.49
+    assert all(pause >= 0.79 for pause in pauses[1:])
+
+
+def test_a_driver_that_hangs_ends_the_daemon():
+    settings = with_link(9)
+
+    async def hung(_: Settings) -> AsyncGenerator[Frame, None]:
+        raise SourceHungError("the driver hangs")
+        yield
+
+    async def test() -> None:
+        daemon = Daemon(settings, sources=hung)
+        await daemon.startup()
+        try:
+            with pytest.raises(SourceHungError):
+                async with asyncio.timeout(WITHIN_S):
+                    await daemon.main_loop()
+        finally:
+            await daemon.shutdown()
+
+    asyncio.run(test())
+
+
+def test_a_link_that_cannot_be_opened_does_not_stop_the_sound():
+    settings = from_table({"mavlink": {"link": f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}"}})
+
+    async def test() -> None:
+        async with running(settings, sources=source(settings)) as daemon:
+            await until(lambda: daemon.counters.estimates > 20 and daemon.link.last_error)
+            assert not daemon.link.up
+
+    asyncio.run(test())
+
+
+def test_an_unfit_model_stops_the_start():
+    async def test() -> None:
+        daemon = Daemon(from_table({"bearing": {"estimator": "model:absent"}}))
+        with pytest.raises(ModelError):
+            await daemon.startup()
+
+    asyncio.run(test())
+
+
+# --- end
+
+
+def test_the_end_of_a_recording_ends_the_main_loop_after_the_last_frame():
+    settings = with_link(9)
+    frames = steady(settings)
+
+    async def recording(_: Settings) -> AsyncGenerator[Frame, None]:
+        for frame in frames[:8]:
+            yield frame
+
+    async def test() -> None:
+        daemon = Daemon(settings, sources=recording)
+        await daemon.startup()
+        async with asyncio.timeout(WITHIN_S):
+            await daemon.main_loop()
+        await daemon.shutdown()
+        assert daemon.counters.estimates == 8
+
+    asyncio.run(test())
+
+
+def test_shutdown_drains_what_is_in_the_queue_and_closes_the_source():
+    settings = with_link(9, daemon={"queue_frames": 100})
+    frames, closed = steady(settings), []
+
+    async def burst(_: Settings) -> AsyncGenerator[Frame, None]:
+        try:
+            for frame in frames:
+                yield frame
+            await asyncio.Event().wait()
+        finally:
+            closed.append(True)
+
+    async def test() -> None:
+        daemon = Daemon(settings, sources=burst)
+        await daemon.startup()
+        await until(lambda: daemon.counters.frames == len(frames))
+        daemon.stop()
+        await daemon.main_loop()
+        await daemon.shutdown()
+        assert daemon.counters.estimates == len(frames)
+        assert closed == [True]
+        assert [t for t in asyncio.all_tasks() if t is not asyncio.current_task()] == []
+
+    asyncio.run(test())
+
+
+# --- the service manager
+
+
+def test_ready_comes_with_the_first_sound_and_the_watchdog_only_with_sound(monkeypatch, tmp_path):
+    settings = with_link(9, daemon={"stall_s": 0.5})
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        said: list[bytes] = []
+
+        def listen() -> bytes:
+            try:
+                while True:
+                    said.append(manager.recv(200))
+            except BlockingIOError:
+                return b"\n".join(said)
+
+        gate = asyncio.Event()
+        endless = source(settings)
+
+        async def late(s: Settings) -> AsyncGenerator[Frame, None]:
+            await gate.wait()
+            async for frame in endless(s):
+                if not gate.is_set():
+                    await asyncio.Event().wait()
+                yield frame
+
+        async def test() -> None:
+            async with running(settings, sources=late) as daemon:
+                await asyncio.sleep(1.3)
+                assert b"READY" not in listen()
+                assert b"WATCHDOG" not in listen()
+                gate.set()
+                await until(lambda: b"READY=1" in listen() and b"WATCHDOG=1" in listen())
+                gate.clear()
+                await until(lambda: not daemon.hearing)
+                listen()
+                before = said.count(b"WATCHDOG=1\n")
+                await asyncio.sleep(1.3)
+                assert said.count(b"WATCHDOG=1\n") == before
+                assert b"STATUS=no sound" in listen()
+            assert b"STOPPING=1" in listen()
+
+        asyncio.run(test())
+
+
+# --- as a process
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "locagen_edge", "run", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error"},
+    )
+
+
+@pytest.fixture
+def settings_file(tmp_path, ground):
+    path = tmp_path / "settings.toml"
+    path.write_text(f'[mavlink]\nlink = "udpout:127.0.0.1:{port_of(ground)}"\n')
+    return str(path)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_process_cleanly(settings_file, number):
+    process = start("--settings", settings_file)
+    lines = [process.stdout.readline() for _ in range(3)]
+    process.send_signal(number)
+    out, err = process.communicate(timeout=5)  # a second is the law; the rest is for a loaded machine
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    assert "true" in lines[2]
+    assert " dropped, " in out
+
+
+def test_seconds_end_it_by_itself(settings_file):
+    process = start("--settings", settings_file, "--seconds", "2.5")
+    out, err = process.communicate(timeout=WITHIN_S)
+    assert process.returncode == 0, err
+    live = [line for line in out.splitlines() if " s  bearing" in line]
+    assert len(live) == 2
+    for line in live:
+        assert "true" in line
+        assert "sent" in line
+        assert "NAMED_VALUE_FLOAT" in line
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("mavsdk") is None, reason="needs the mavsdk package (extra: dev)"
+)
+def test_mavsdk_hears_the_bearing_of_the_running_service(tmp_path):
+    """The default scene from end to end: sound in one process, a ground station in another."""
+    port = free_port(socket.SOCK_DGRAM)
+    path = tmp_path / "settings.toml"
+    path.write_text(f'[mavlink]\nlink = "udpout:127.0.0.1:{port}"\n[sim]\nturn_deg_s = 0\nsnr_db = 20\n')
+
+    async def test() -> None:
+        async with mavsdk("ground", f"udpin://127.0.0.1:{port}") as peer:
+            process = start("--settings", str(path), "--quiet")
+            try:
+                await peer.until(lambda _: len(peer.messages("NAMED_VALUE_FLOAT")) > 20)
+                await peer.until(lambda _: peer.messages("STATUSTEXT"))
+            finally:
+                process.terminate()
+                process.communicate(timeout=WITHIN_S)
+            values = [m["fields"] for m in peer.messages("NAMED_VALUE_FLOAT")]
+            azimuths = [v["value"] for v in values if v["name"] == "LG_AZB"]
+            assert np.median(azimuths) == pytest.approx(40.0, abs=3.0)
+            assert peer.messages("STATUSTEXT")[0]["fields"]["text"].startswith("Call heard")
+
+    asyncio.run(test())
