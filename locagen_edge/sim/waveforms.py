@@ -50,6 +50,9 @@ WHITE_LOW_HZ = 100.0
 RECORDED = "recorded"
 SOUNDS = (*CALLS, RECORDED)
 
+SILENCE: C64 = np.zeros((1, 1, 1), dtype=np.complex64)
+"""spectra (samples, mics, bins) of nothing"""
+
 Sounds = Sequence[tuple[str, F32]]
 """recorded sounds: (name, (n,) at the scene's rate)"""
 
@@ -396,9 +399,9 @@ class Studio:
     def _rotors(self, mics_m: F64, power: F64, rng: np.random.Generator) -> C64:
         """Spectra (count, mics, bins) of all rotors, with near-field delays and gains."""
         scene, count = self.scene, len(mics_m)
-        total = np.zeros((count, mics_m.shape[1], len(self.frequency_hz)), dtype=np.complex64)
         if not scene.rotors:
-            return total
+            return SILENCE
+        total = np.zeros((count, mics_m.shape[1], len(self.frequency_hz)), dtype=np.complex64)
         throttle = rng.uniform(scene.throttle[0], scene.throttle[1], count)
         hubs = hubs_m(scene.rotors, scene.rotor_arm_m, scene.rotor_z_m)
         away_s = float(np.linalg.norm(hubs[0])) / self.speed_m_s  # all hubs are as far
@@ -422,7 +425,7 @@ class Studio:
         """Spectra (count, mics, bins)."""
         scene = self.scene
         if not scene.wind_m_s:
-            return np.zeros((1, 1, 1), dtype=np.complex64)
+            return SILENCE
         spectra = wind(mics_m, self.frequency_hz, self.size, scene.wind_m_s, rng)
         spectra *= np.float32(math.sqrt(from_db(scene.wind_dbfs)))
         return spectra
