@@ -31,3 +31,7 @@ class LinkError(LocagenError):
 
 class KernelError(LocagenError):
     """The C kernel refused its configuration or its input."""
+
+
+class DatasetError(LocagenError):
+    """A data set that cannot be written, is not complete, or is not what the settings ask for."""

@@ -133,7 +133,11 @@ class AudioSettings:
 class SimSettings:
     """The synthetic scene: a caller that circles a hovering drone, heard under four rotors."""
 
-    call: str = setting("scream", "What calls.", choices=("white", "speech", "scream", "whistle", "tone"))
+    call: str = setting(
+        "scream",
+        "What calls.",
+        choices=("white", "speech", "scream", "whistle", "tone", "knock", "instrument"),
+    )
     azimuth_deg: float = setting(
         40.0, "Where the caller starts, clockwise from ahead.", unit="degrees", least=-360, most=360
     )

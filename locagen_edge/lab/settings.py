@@ -15,6 +15,11 @@ from locagen_edge.errors import SettingsError
 from locagen_edge.geometry import MicArray, equilateral
 from locagen_edge.settings import Settings, sample, setting
 from locagen_edge.sim.arrivals import TwinSettings
+from locagen_edge.sim.rotors import hubs_m
+from locagen_edge.sim.waveforms import RECORDED, SceneSettings
+
+NEAREST_HUB_M = 0.02
+"""A hub is not a point: nearer than this, 1 / r means nothing."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,29 @@ class DataSettings:
         least=0.01, most=0.5,
     )  # fmt: skip
     seed: int = setting(1, "Same seed, same data.", least=0, most=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class DatasetSettings:
+    """Data sets on disk."""
+
+    level: str = setting(
+        "arrivals",
+        "What is simulated. `arrivals`: times alone, under [twin]. `waveforms`: sound, under [twin] and "
+        "[scene], from which the flight's own correlation makes the delays.",
+        choices=("arrivals", "waveforms"),
+    )
+    shard: int = setting(
+        4096,
+        "Samples in a file: what an interrupted run may lose, and what has to fit into memory at once.",
+        unit="samples", least=1, most=10_000_000,
+    )  # fmt: skip
+    keep: tuple[str, ...] = setting(
+        (),
+        "What is kept of waveforms beside delays and truth. `correlation`: of all pairs, at all lags. "
+        "`sound`: what the microphones recorded. `call`: the same without any noise.",
+        choices=("correlation", "sound", "call"),
+    )
 
 
 @dataclass(frozen=True)
@@ -90,7 +118,9 @@ class LabSettings(Settings):
     """All settings of the flight and of the workshop. Every section and every key may be left out."""
 
     twin: TwinSettings = TwinSettings()  # noqa: RUF009 - frozen
+    scene: SceneSettings = SceneSettings()  # noqa: RUF009 - frozen
     data: DataSettings = DataSettings()
+    dataset: DatasetSettings = DatasetSettings()
     forest: ForestSettings = ForestSettings()
     mlp: MlpSettings = MlpSettings()
     siren: SirenSettings = SirenSettings()
@@ -102,6 +132,7 @@ class LabSettings(Settings):
         except SettingsError as error:
             faults += str(error).splitlines()
         faults += _faults_of_twin(self)
+        faults += _faults_of_scene(self)
         if faults:
             raise SettingsError("\n".join(faults))
 
@@ -126,6 +157,32 @@ def _faults_of_twin(s: LabSettings) -> Iterator[str]:
             f"twin.position_error_m: {s.twin.position_error_m:g} m could put two microphones, "
             f"{2 * largest:.3g} m apart, at the same place"
         )
+
+
+def _faults_of_scene(s: LabSettings) -> Iterator[str]:
+    scene = s.scene
+    if s.dataset.level == "waveforms" and s.twin.noise == "fixed":
+        yield "twin.noise: `fixed` is an error of arrivals; dataset.level = waveforms knows `none` and `snr`"
+    if not scene.sounds:
+        yield "scene.sounds: is empty"
+    if RECORDED in scene.sounds and not scene.recordings:
+        yield "scene.recordings: is empty, but scene.sounds names recorded"
+    if len(scene.throttle) != 2 or not scene.throttle[0] <= scene.throttle[1]:
+        yield f"scene.throttle: {list(scene.throttle)} is not a lowest and a highest throttle"
+    if len(scene.gain_db) != len(s.array.positions_m):
+        yield (
+            f"scene.gain_db: {len(scene.gain_db)} gains, "
+            f"but array.positions_m has {len(s.array.positions_m)} microphones"
+        )
+    seconds = (s.audio.frame + (scene.frames - 1) * s.audio.hop) / max(s.audio.rate_hz, 1)
+    if scene.lead_s >= seconds:
+        yield f"scene.lead_s: {scene.lead_s:g} s of noise alone, but a sample lasts {seconds:.3g} s"
+    if scene.rotors and _smallest_spacing(s) > 0.0:
+        places = np.array(s.array.positions_m)
+        hubs = hubs_m(scene.rotors, scene.rotor_arm_m, scene.rotor_z_m)
+        nearest = np.linalg.norm((places - places.mean(axis=0))[:, None] - hubs, axis=2).min()
+        if nearest < NEAREST_HUB_M + s.twin.position_error_m:
+            yield f"scene.rotor_arm_m: puts a hub {nearest:.3g} m from a microphone"
 
 
 def _smallest_spacing(s: LabSettings) -> float:

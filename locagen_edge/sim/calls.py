@@ -83,10 +83,61 @@ def tone(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F64
     return sine
 
 
+def knock(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F64:
+    """Knuckles on wood: blows three to seven times a second, each a dozen modes of the panel that die away
+    within 5 to 40 ms, the high ones first. Between the blows there is nothing.
+    """
+    out = np.zeros(n)
+    start = int(0.3 * rng.uniform() * min(n, 0.15 * rate_hz))
+    modes_hz = np.exp(rng.uniform(np.log(250.0), np.log(min(3000.0, 0.8 * top_hz)), (12, 1)))
+    while start < n:
+        t = np.arange(min(n - start, round(0.25 * rate_hz))) / rate_hz
+        ringing = np.exp(-t * modes_hz / rng.uniform(8.0, 16.0))
+        panel = rng.standard_normal(12) @ (ringing * np.sin(2.0 * np.pi * modes_hz * t))
+        # a knuckle is soft: it pushes for half a millisecond, so nothing begins at once
+        out[start : start + len(t)] += rng.uniform(0.6, 1.0) * panel * -np.expm1(-((t / 5e-4) ** 2))
+        start += round(rng.uniform(0.14, 0.33) * rate_hz)
+    return _below(out, rate_hz, top_hz)
+
+
+def instrument(n: int, rate_hz: float, top_hz: float, rng: np.random.Generator) -> F64:
+    """A melody on one instrument: notes of two octaves above middle C, plucked or blown, each with harmonics
+    that fall as a power of their number, and a slight vibrato.
+    """
+    out = np.zeros(n)
+    fall, attack_s, decay_s = rng.uniform(0.8, 1.8), rng.uniform(0.004, 0.04), rng.uniform(0.1, 2.0)
+    start = 0
+    while start < n:
+        length = round(rng.uniform(0.2, 0.6) * rate_hz)
+        if n - start < 1.5 * length:  # no crumbs
+            length = n - start
+        note_hz = 261.63 * 2.0 ** (rng.integers(25) / 12.0)
+        harmonics = np.arange(1, max(2, int(top_hz / (1.01 * note_hz)) + 1))
+        t = np.arange(length) / rate_hz
+        pitch = note_hz * (1.0 + 0.005 * np.sin(2.0 * np.pi * 5.5 * t))
+        loudness = -np.expm1(-((t / attack_s) ** 2)) * np.exp(-t / decay_s)
+        loudness *= np.minimum((length - np.arange(length)) / (0.01 * rate_hz), 1.0)
+        out[start : start + length] = loudness * wave(
+            wavetable(harmonics**-fall, rng), turns_of(pitch, rate_hz)
+        )
+        start += length
+    return out
+
+
+def _below(sound: F64, rate_hz: float, top_hz: float) -> F64:
+    """The same without what lies above `top_hz`."""
+    spectrum = np.fft.rfft(sound)
+    spectrum[np.fft.rfftfreq(len(sound), 1.0 / rate_hz) > top_hz] = 0.0
+    below: F64 = np.fft.irfft(spectrum, len(sound))
+    return below
+
+
 CALLS: dict[str, Call] = {
     "white": white,
     "speech": speech,
     "scream": scream,
     "whistle": whistle,
     "tone": tone,
+    "knock": knock,
+    "instrument": instrument,
 }

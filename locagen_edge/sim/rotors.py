@@ -32,10 +32,10 @@ def blade_rate_hz(throttle: float) -> float:
     return BLADES * (IDLE_REV_S + throttle * (FULL_REV_S - IDLE_REV_S))
 
 
-def hubs_m(rotors: int, arm_m: float) -> F64:
-    """(rotors, 3): hubs evenly around the origin in the array's plane, none straight ahead (an X frame)."""
+def hubs_m(rotors: int, arm_m: float, z_m: float = 0.0) -> F64:
+    """(rotors, 3): hubs evenly around the origin, `z_m` below it, none straight ahead (an X frame)."""
     azimuth = np.pi / max(rotors, 1) * (2.0 * np.arange(rotors) + 1.0)
-    return arm_m * np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(rotors)], axis=1)
+    return arm_m * np.stack([np.cos(azimuth), np.sin(azimuth), np.full(rotors, z_m / arm_m)], axis=1)
 
 
 class BladeRate:
@@ -55,8 +55,14 @@ class BladeRate:
         return turns
 
 
-def rotor(throttle: float, rate_hz: float, top_hz: float, rng: np.random.Generator) -> Iterator[F64]:
-    """The endless sound of one rotor in pieces (any,): in-band power 1 on average, nothing above `top_hz`."""
+def rotor(
+    throttle: float, rate_hz: float, top_hz: float, rng: np.random.Generator, piece: int = PIECE
+) -> Iterator[F64]:
+    """The endless sound of one rotor in pieces (any,): in-band power 1 on average, nothing above `top_hz`.
+
+    `piece` samples of noise are made at once; the first piece yielded is `piece - OVERLAP` long, and its
+    broadband part fades in over OVERLAP samples.
+    """
     blades = BladeRate(throttle, rng)
     amplitudes = _amplitudes(blades, rate_hz, top_hz)
     table = wavetable(amplitudes, rng)
@@ -65,7 +71,7 @@ def rotor(throttle: float, rate_hz: float, top_hz: float, rng: np.random.Generat
 
     def noise() -> Iterator[F64]:
         while True:
-            yield band_noise(PIECE, rate_hz, LOW_HZ, top_hz, rng, slope=1.0)
+            yield band_noise(piece, rate_hz, LOW_HZ, top_hz, rng, slope=1.0)
 
     start = 0
     for broadband in joined(noise(), OVERLAP):

@@ -1,0 +1,48 @@
+"""Recorded sounds for the twin: every sound file of a folder, mono, at the rate of the scene."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import soxr
+
+from locagen_edge.errors import DatasetError
+from locagen_edge.types import F32
+
+ENDINGS = (".wav", ".flac", ".ogg")
+
+
+@lru_cache(maxsize=2)  # a worker makes one shard after another from the same folder
+def load(folder: str, rate_hz: int) -> tuple[tuple[str, F32], ...]:
+    """(name, (n,)) of all sound files below a folder, in the order of their names.
+
+    Channels are averaged. Raises `DatasetError` where there is none, or one cannot be read.
+    """
+    files = sorted(p for p in Path(folder).rglob("*") if p.suffix.lower() in ENDINGS)
+    if not files:
+        raise DatasetError(f"scene.recordings: no {', '.join(ENDINGS)} file in {folder}")
+    sounds = []
+    for file in files:
+        try:
+            sound, file_hz = soundfile.read(file, dtype="float32", always_2d=True)
+        except (soundfile.LibsndfileError, OSError) as error:
+            raise DatasetError(f"{file}: cannot be read: {error}") from error
+        mono = np.asarray(soxr.resample(sound.mean(axis=1), file_hz, rate_hz), dtype=np.float32)
+        if mono.any():  # a file of zeros cannot call
+            sounds.append((file.relative_to(folder).as_posix(), mono))
+    if not sounds:
+        raise DatasetError(f"scene.recordings: nothing but silence in {folder}")
+    return tuple(sounds)
+
+
+def fingerprint(folder: str, rate_hz: int) -> str:
+    """SHA-256 of names and sounds, so that two data sets from different files are told apart."""
+    digest = hashlib.sha256()
+    for name, sound in load(folder, rate_hz):
+        digest.update(f"{name}\0{len(sound)}\0".encode())
+        digest.update(sound.tobytes())
+    return digest.hexdigest()
