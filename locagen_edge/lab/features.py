@@ -19,7 +19,7 @@ ZERO = 1e-6
 
 
 class Features(torch.nn.Module):
-    """Normalised delays (n, pairs) to (n, 2 mics - 3): base delays standardised, then their ratios to the first.
+    """Normalised delays (n, pairs) to (n, 2 mics - 3): base delays standardised, then ratios to the first.
 
     Where the first base delay is zero the ratio is 0: it has no sign there, and of the numbers that could
     stand for it only 0 favours neither. With whole-sample delays at 10 kHz that is one sample in seven.

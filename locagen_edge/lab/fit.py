@@ -35,7 +35,17 @@ def fit(
     of all azimuths that lead to it. The last `validation_share` of the samples are not trained on: the pass
     with the smallest mean |error| there counts, and `s.patience` passes without a better one end it.
     """
-    held = max(int(len(x) * validation_share), 1)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # layers this small take longer on two threads than on one
+    try:
+        return _fit(model, x, azimuth_rad, s, max(int(len(x) * validation_share), 1))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _fit(
+    model: torch.nn.Module, x: F32, azimuth_rad: F32, s: MlpSettings | SirenSettings, held: int
+) -> History:
     inputs, held_inputs = torch.from_numpy(x[:-held]), torch.from_numpy(x[-held:])
     wanted = torch.from_numpy(np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=1).astype(np.float32))
     generator = torch.Generator().manual_seed(s.seed)
@@ -47,7 +57,7 @@ def fit(
     for epoch in range(s.epochs):
         model.train()
         order = torch.randperm(len(inputs), generator=generator)
-        for rows in order.split(s.batch):
+        for rows in torch.split(order, s.batch):  # type: ignore[no-untyped-call]
             loss = torch.nn.functional.mse_loss(model(inputs[rows]), wanted[rows])
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]

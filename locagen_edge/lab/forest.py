@@ -71,7 +71,8 @@ class Forest:
 
     def _bin(self, azimuth_rad: F32) -> np.ndarray:
         turns = (azimuth_rad.astype(np.float64) - self._first) / (2.0 * np.pi) % 1.0
-        return np.minimum((turns * self.bins).astype(np.int64), self.bins - 1)
+        bins: np.ndarray = np.minimum((turns * self.bins).astype(np.int64), self.bins - 1)
+        return bins
 
     @property
     def _centres(self) -> F64:
@@ -82,10 +83,13 @@ class Forest:
     def _read(self, probability: F64) -> F64:
         """Cosine and sine (n, 2) from probabilities (n, classes)."""
         if self.reading == "mean":
-            return probability @ _directions(self._centres)
+            mean: F64 = probability @ _directions(self._centres)
+            return mean
         if self.reading == "centre":
-            return _directions(self._centres)[probability.argmax(axis=1)]
-        return _directions(_candidates())[(probability @ self._cost()).argmin(axis=1)]
+            likeliest: F64 = _directions(self._centres)[probability.argmax(axis=1)]
+            return likeliest
+        median: F64 = _directions(_candidates())[(probability @ self._cost()).argmin(axis=1)]
+        return median
 
     def _cost(self) -> F64:
         """(classes, candidates) mean |error| of each candidate for azimuths spread evenly over each bin."""
@@ -97,9 +101,7 @@ class Forest:
 
     def to_onnx(self, features: Features, pairs: int) -> bytes:
         """Normalised delays (1, pairs) to cosine and sine (1, 2)."""
-        model = onnx.load_model_from_string(
-            to_onnx(features, torch.zeros(1, pairs), "delays", "features")
-        )
+        model = onnx.load_model_from_string(to_onnx(features, torch.zeros(1, pairs), "delays", "features"))
         graph, last = model.graph, model.graph.output[0].name
         values = [_leaf_values(tree, self.bins) for tree in self._model.estimators_]
         if self.bins and self.reading == "mean":
@@ -138,19 +140,21 @@ def _directions(azimuth_rad: F64) -> F64:
 
 
 def _candidates() -> F64:
-    return np.arange(CANDIDATES) * (2.0 * np.pi / CANDIDATES)
+    return np.arange(CANDIDATES, dtype=np.float64) * (2.0 * np.pi / CANDIDATES)
 
 
 def _leaf_values(tree: Any, bins: int) -> F64:
     """(nodes, outputs) what each node of a fitted tree would answer."""
     value: F64 = tree.tree_.value
     if not bins:
-        return value[:, :, 0]
-    return value[:, 0, :] / value[:, 0, :].sum(axis=1, keepdims=True)
+        value = value[:, :, 0]
+        return value
+    value = value[:, 0, :] / value[:, 0, :].sum(axis=1, keepdims=True)
+    return value
 
 
 def _ensemble(trees: list[Any], values: list[F64], source: str, target: str) -> onnx.NodeProto:
-    """The mean of all trees as one node: arrays over all nodes of all trees, leaves by (tree, node, output)."""
+    """The mean of all trees as one node: arrays over all nodes of all trees."""
     parts: dict[str, list[np.ndarray]] = {name: [] for name in ("tree", "node", "mode", "feature", "at")}
     parts |= {name: [] for name in ("yes", "no", "leaf_tree", "leaf_node", "leaf_output", "leaf_value")}
     for number, (fitted, value) in enumerate(zip(trees, values, strict=True)):
