@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from locagen_edge.lab.anova import two_way
-from locagen_edge.lab.bound import best_table, cells, errors_rad, look_up
+from locagen_edge.lab.bound import best_table, errors_rad, look_up
 from locagen_edge.lab.export import install
 from locagen_edge.lab.methods import METHODS, split, take, train
 from locagen_edge.lab.settings import LabSettings
@@ -42,7 +42,8 @@ PAPER: dict[str, Any] = {
 }
 """Figures of Kunwar, Cantor, Rizzo & Qayyum; the SIREN's is told as "about 90 degrees"."""
 
-RATES_HZ = (10_000, 24_000, 44_100, 48_000)
+SLOW_HZ, FAST_HZ = 10_000, 48_000
+"""The paper's two rates."""
 START_M = (10.0, 10.0)
 """Where the paper's minimiser is started in the tables of all methods; `assumptions` tries others."""
 
@@ -51,8 +52,11 @@ START_M = (10.0, 10.0)
 class Scale:
     """How much of everything: the full run, or a quick one that only shows that all parts work."""
 
+    samples: int = 100_000_000
+    """of [data] at most"""
     held_out: int = 200_000
     table: int = 4_000_000
+    rates_hz: tuple[int, ...] = (10_000, 24_000, 44_100, 48_000)
     spacings_m: tuple[float, ...] = (0.02, 0.05, 0.10, 0.20, 0.50, 1.00)
     learning: tuple[int, ...] = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
     repeats: int = 100
@@ -65,13 +69,25 @@ class Scale:
     """and forests"""
 
 
-QUICK = Scale(20_000, 200_000, (0.05, 0.10, 1.00), (1_000, 10_000), 10, 20, 4, 10)
+QUICK = Scale(
+    samples=6_000,
+    held_out=20_000,
+    table=200_000,
+    rates_hz=(10_000, 48_000),
+    spacings_m=(0.05, 0.10),
+    learning=(1_000, 5_000),
+    repeats=10,
+    calls=20,
+    epochs=6,
+    trees=10,
+)
 
 
 def reduced(s: LabSettings, scale: Scale) -> LabSettings:
     """The settings with no more trees and passes than the scale allows."""
     return dataclasses.replace(
         s,
+        data=dataclasses.replace(s.data, samples=min(s.data.samples, scale.samples)),
         forest=dataclasses.replace(s.forest, trees=min(s.forest.trees, scale.trees)),
         mlp=dataclasses.replace(s.mlp, epochs=min(s.mlp.epochs, scale.epochs)),
         siren=dataclasses.replace(s.siren, epochs=min(s.siren.epochs, scale.epochs)),
@@ -114,14 +130,18 @@ def errors(estimate: F64, true: Any) -> F64:
     return np.where(np.isnan(estimate), math.pi / 2, errors_rad(np.nan_to_num(estimate), true))
 
 
+def azimuth_of(answers: Azimuths) -> Azimuths:
+    """Of a solver's azimuth, x and y the azimuth alone."""
+    return lambda delay_s: answers(delay_s)[0]
+
+
 def unlearned(s: LabSettings) -> dict[str, Azimuths]:
     """The methods that learn nothing, by name."""
     rate = s.audio.rate_hz
-    solve = flight(s, hyperbolic(s))
     return {
         "least squares": least_squares(s),
-        "hyperbolic": over_cells(lambda delay_s: solve(delay_s)[0], rate),
-        "minimiser": over_cells(fixed_start(s, START_M), rate),
+        "hyperbolic": azimuth_of(over_cells(flight(s, hyperbolic(s)), rate)),
+        "minimiser": azimuth_of(over_cells(fixed_start(s, START_M), rate)),
     }
 
 
@@ -151,7 +171,7 @@ def best(s: LabSettings, draws: Draws) -> Azimuths:
 
 
 def answers(s: LabSettings, draws: Draws, names: tuple[str, ...]) -> Iterator[tuple[str, Azimuths]]:
-    """Every method ready to be asked: the best possible first, then those that learn nothing, then `names`."""
+    """Every method ready to be asked: the best possible, those that learn nothing, then `names`."""
     yield "best possible", best(s, draws)
     yield from unlearned(s).items()
     for name in names:
@@ -182,7 +202,7 @@ SWEPT = ("forest", "mlp", "siren")
 
 def by_rate(s: LabSettings, scale: Scale) -> dict[str, Any]:
     """MAE of every method at every sample rate."""
-    return {str(rate): table(at_rate(s, rate), scale, tuple(METHODS)) for rate in RATES_HZ}
+    return {str(rate): table(at_rate(s, rate), scale, tuple(METHODS)) for rate in scale.rates_hz}
 
 
 def by_spacing(s: LabSettings, scale: Scale) -> dict[str, Any]:
@@ -199,7 +219,7 @@ def distribution(s: LabSettings, scale: Scale) -> dict[str, Any]:
     for name in ("minimiser", "hyperbolic", "forest-12", "forest"):
         off = np.degrees(errors(methods[name](low.held_out.delay_s), low.held_out.azimuth_rad))
         histogram[name] = (np.histogram(off, edges)[0] / len(off)).tolist()
-    high = at_rate(s, RATES_HZ[-1])
+    high = at_rate(s, FAST_HZ)
     draws = Draws.of(high, scale)
     percent = np.linspace(0.0, 100.0, 201)
     cdf = {}
@@ -217,31 +237,38 @@ def distribution(s: LabSettings, scale: Scale) -> dict[str, Any]:
 def offsets(s: LabSettings, scale: Scale) -> dict[str, Any]:
     """Does a fixed sampling offset of a microphone matter? 10 x 10 offsets of microphones 1 and 2.
 
-    The position is the flight solver's, its range cut at the disc's edge; ANOVA of the position error, as in
-    the paper, and of the azimuth error.
+    ANOVA of the error in position, as in the paper, of two solvers, ranges cut at the disc's edge: the
+    flight's, and the paper's from a fixed start. And of the flight's error in azimuth.
     """
     levels = np.arange(10) / 10.0
     rate = s.audio.rate_hz
-    solve = flight(s, hyperbolic(s))
-    place, angle = np.empty((2, 10, 10, scale.repeats))
+    solvers = {
+        "hyperbolic": over_cells(flight(s, hyperbolic(s)), rate),
+        "minimiser": over_cells(fixed_start(s, START_M), rate),
+    }
+    place = {name: np.empty((10, 10, scale.repeats)) for name in solvers}
+    angle = np.empty((10, 10, scale.repeats))
     others = (0.0,) * (s.mic_array.mics - 3)
     for a, first in enumerate(levels):
         for b, second in enumerate(levels):
             here = with_twin(s, offset_samples=(0.0, float(first), float(second), *others))
             data = sample(here, scale.repeats, s.data.seed + 3, (10 * a + b) * scale.repeats)
-            _, one, back = np.unique(cells(data.delay_s, rate), return_index=True, return_inverse=True)
-            azimuth, position = (x[..., back] for x in solve(data.delay_s[:, one]))
-            range_m = np.maximum(np.hypot(*position), 1e-9)
-            position = position * np.minimum(1.0, s.twin.range_m / range_m)
-            place[a, b] = np.hypot(*(position - data.position_m))
-            angle[a, b] = np.degrees(errors(azimuth, data.azimuth_rad))
+            for name, solve in solvers.items():
+                azimuth, *position = solve(data.delay_s)
+                range_m = np.maximum(np.hypot(*position), 1e-9)
+                near = np.array(position) * np.minimum(1.0, s.twin.range_m / range_m)
+                place[name][a, b] = np.hypot(*(np.nan_to_num(near) - data.position_m))
+                if name == "hyperbolic":
+                    angle[a, b] = np.degrees(errors(azimuth, data.azimuth_rad))
+    measured = {f"position, {name}": (y, "m") for name, y in place.items()}
+    measured["azimuth"] = (angle, "degrees")
     return {
         "levels_samples": levels.tolist(),
-        "points": int(place.size),
-        "position_m": place.mean(axis=2).tolist(),
-        "azimuth_deg": angle.mean(axis=2).tolist(),
-        "position_p": two_way(place),
-        "azimuth_p": two_way(angle),
+        "points": int(angle.size),
+        "errors": {
+            name: {"unit": unit, "mean": y.mean(axis=2).tolist(), "sd": float(y.std()), "p": two_way(y)}
+            for name, (y, unit) in measured.items()
+        },
     }
 
 
@@ -292,7 +319,7 @@ def _times_us(calls: list[Callable[[], Any]]) -> dict[str, Any]:
 
 def learning(s: LabSettings, scale: Scale) -> dict[str, Any]:
     """MAE at 48 kHz over the number of training samples; at 10 kHz a thousand are enough for all."""
-    high = at_rate(s, RATES_HZ[-1])
+    high = at_rate(s, FAST_HZ)
     draws = Draws.of(high, scale)
     rate = high.audio.rate_hz
     data = sample(high, max(scale.learning), s.data.seed + 4)
@@ -343,8 +370,8 @@ def assumptions(s: LabSettings, scale: Scale) -> dict[str, Any]:
     """
     rows: dict[str, Any] = {}
     for name, change in ASSUMPTIONS.items():
-        low = change(at_rate(s, RATES_HZ[0]))
-        high = change(at_rate(s, RATES_HZ[-1]))
+        low = change(at_rate(s, SLOW_HZ))
+        high = change(at_rate(s, FAST_HZ))
         draws, fast = Draws.of(low, scale), Draws.of(high, scale)
         centred = dataclasses.replace(low, forest=dataclasses.replace(low.forest, bins_deg=-15.0))
         rows[name] = {
@@ -358,10 +385,10 @@ def assumptions(s: LabSettings, scale: Scale) -> dict[str, Any]:
         }
     starts: dict[str, Any] = {}
     for name in ("as described, common clock", "half the spacing"):
-        here = ASSUMPTIONS[name](at_rate(s, RATES_HZ[0]))
+        here = ASSUMPTIONS[name](at_rate(s, SLOW_HZ))
         held_out = sample(here, scale.held_out, s.data.seed + 1)
         for start in STARTS_M:
-            azimuths = over_cells(fixed_start(here, (start, start)), RATES_HZ[0])
+            azimuths = azimuth_of(over_cells(fixed_start(here, (start, start)), SLOW_HZ))
             mae = _mean_deg(azimuths, held_out)
             forest = rows[name]["forest-12"]
             starts.setdefault(name, {})[f"{start:g}"] = {"mae_deg": mae, "forest_less": 1.0 - forest / mae}

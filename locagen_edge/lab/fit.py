@@ -57,7 +57,7 @@ def _fit(
     for epoch in range(s.epochs):
         model.train()
         order = torch.randperm(len(inputs), generator=generator)
-        for rows in torch.split(order, s.batch):  # type: ignore[no-untyped-call]
+        for rows in torch.split(order, s.batch):
             loss = torch.nn.functional.mse_loss(model(inputs[rows]), wanted[rows])
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]

@@ -145,12 +145,9 @@ def _candidates() -> F64:
 
 def _leaf_values(tree: Any, bins: int) -> F64:
     """(nodes, outputs) what each node of a fitted tree would answer."""
-    value: F64 = tree.tree_.value
-    if not bins:
-        value = value[:, :, 0]
-        return value
-    value = value[:, 0, :] / value[:, 0, :].sum(axis=1, keepdims=True)
-    return value
+    value = tree.tree_.value
+    counts: F64 = value[:, 0, :] if bins else value[:, :, 0]
+    return counts / counts.sum(axis=1, keepdims=True) if bins else counts
 
 
 def _ensemble(trees: list[Any], values: list[F64], source: str, target: str) -> onnx.NodeProto:

@@ -88,8 +88,8 @@ def apply(features: torch.nn.Module, x: F32) -> F32:
 class Seconds(torch.nn.Module):
     """The base delays in seconds, as they are measured: what a SIREN must not be fed with.
 
-    They are 3e-4 at most, a sine's slope is constant over that, and at the article's learning rate of 1e-4 the
-    weights never grow to where it is not: the answer hardly depends on the input, and is off by 90 degrees.
+    They are 3e-4 at most, a sine's slope is constant over that, and at the article's learning rate of 1e-4
+    the weights never grow to where it is not: the answer hardly depends on the input, and is 90 degrees off.
     """
 
     def __init__(self, mics: int, seconds_per_unit: float) -> None:

@@ -21,14 +21,23 @@ Azimuths = Callable[[F32], F64]
 """Delays (pairs, n) in seconds to azimuths (n,) in radians; NaN where there is no answer."""
 
 
-def over_cells(one_by_one: Azimuths, rate_hz: float) -> Azimuths:
-    """The same method, asked once per combination of whole-sample delays."""
+def over_cells(method: Azimuths, rate_hz: float) -> Azimuths:
+    """The same method, asked once and for all per combination of whole-sample delays.
 
-    def azimuths(delay_s: F32) -> F64:
-        _, first, back = np.unique(cells(delay_s, rate_hz), return_index=True, return_inverse=True)
-        return one_by_one(np.ascontiguousarray(delay_s[:, first]))[back]
+    Its answers may have more axes (..., n).
+    """
+    known: dict[int, F64] = {}
 
-    return azimuths
+    def answers(delay_s: F32) -> F64:
+        seen, first, back = np.unique(cells(delay_s, rate_hz), return_index=True, return_inverse=True)
+        new = np.array([number not in known for number in seen.tolist()], dtype=bool)
+        if new.any():
+            found = method(np.ascontiguousarray(delay_s[:, first[new]]))
+            known.update(zip(seen[new].tolist(), np.moveaxis(found, -1, 0), strict=True))
+        answer: F64 = np.stack([known[number] for number in seen.tolist()], axis=-1)[..., back]
+        return answer
+
+    return answers
 
 
 def least_squares(s: LabSettings) -> Azimuths:
@@ -43,8 +52,8 @@ def least_squares(s: LabSettings) -> Azimuths:
     return azimuths
 
 
-def flight(s: LabSettings, estimator: Estimator) -> Callable[[F32], tuple[F64, F64]]:
-    """A flight estimator over many delays: azimuths (n,) and positions (2, n) from the array's middle.
+def flight(s: LabSettings, estimator: Estimator) -> Azimuths:
+    """A flight estimator over many delays: azimuth, x and y from the array's middle (3, n).
 
     NaN where the estimator has no answer, or gives no position.
     """
@@ -52,21 +61,21 @@ def flight(s: LabSettings, estimator: Estimator) -> Callable[[F32], tuple[F64, F
     middle = s.mic_array.positions_m.mean(axis=0)
     sigma = np.full(pairs, 1.0 / (np.sqrt(6.0) * s.audio.rate_hz))  # of a delay between rounded arrivals
 
-    def both(delay_s: F32) -> tuple[F64, F64]:
-        azimuth, position = np.full(delay_s.shape[1], np.nan), np.full((2, delay_s.shape[1]), np.nan)
+    def answers(delay_s: F32) -> F64:
+        found = np.full((3, delay_s.shape[1]), np.nan)
         for k, delay in enumerate(delay_s.T.astype(np.float64)):
             bearing = estimator(Tdoa(delay, sigma, np.ones(pairs)))
             if bearing.azimuth_rad is not None:
-                azimuth[k] = bearing.azimuth_rad
+                found[0, k] = bearing.azimuth_rad
             if bearing.fix is not None:
-                position[:, k] = (bearing.fix.position_m - middle)[:2]
-        return azimuth, position
+                found[1:, k] = (bearing.fix.position_m - middle)[:2]
+        return found
 
-    return both
+    return answers
 
 
 def fixed_start(s: LabSettings, start_m: tuple[float, float]) -> Azimuths:
-    """The paper's minimiser as one would first write it: BFGS for x and y from one fixed point.
+    """The paper's minimiser as one would first write it: BFGS from one fixed point; azimuth, x and y (3, n).
 
     Minimises sum_m ((d_m - d_1) - c tau_1m)^2 in metres with SciPy's default method. A kilometre away the sum
     hardly changes with range, a source at the start's back is many gentle metres off, and the default
@@ -75,18 +84,19 @@ def fixed_start(s: LabSettings, start_m: tuple[float, float]) -> Azimuths:
     array = s.mic_array
     places = array.positions_m[:, :2] - array.positions_m[:, :2].mean(axis=0)
 
-    def azimuths(delay_s: F32) -> F64:
+    def answers(delay_s: F32) -> F64:
         ways = delay_s[: array.mics - 1].T.astype(np.float64) * s.speed_m_s
-        return np.array([_from_start(places, way, start_m) for way in ways])
+        at = np.array([_from_start(places, way, start_m) for way in ways]).T
+        return np.stack([np.arctan2(at[1], at[0]), *at])
 
-    return azimuths
+    return answers
 
 
-def _from_start(places: F64, way_m: F64, start_m: tuple[float, float]) -> float:
+def _from_start(places: F64, way_m: F64, start_m: tuple[float, float]) -> F64:
     def cost(at: F64) -> float:
         distance = np.hypot(*(places - at).T)
         off = distance[1:] - distance[0] - way_m
         return float(off @ off)
 
-    x, y = minimize(cost, start_m, method="BFGS").x
-    return float(np.arctan2(y, x))
+    place: F64 = minimize(cost, start_m, method="BFGS").x
+    return place
