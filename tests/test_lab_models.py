@@ -1,4 +1,4 @@
-"""The paper's models: features, readings of bins, how near they come to the best possible, parity, by name."""
+"""The paper's models: features, readings of bins, nearness to the best possible, parity, use by name."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_normalised_delays_are_shares_of_the_longest() -> None:
         direction(math.pi / 2), s.speed_m_s
     )  # microphones 1 and 2 stand left and right
     found = normalised(along.astype(np.float32)[:, None], s.mic_array, s.speed_m_s)
-    np.testing.assert_allclose(found, [[-0.5, 0.5, 1.0]], atol=1e-6)
+    np.testing.assert_allclose(found, [[-0.5, 0.5, 1.0]], atol=1e-5)  # positions are rounded to 1 um
 
 
 @pytest.mark.parametrize("rate", [10_000, 48_000])
@@ -143,10 +143,9 @@ def test_exported_models_say_what_the_trained_ones_say(name, rounding) -> None:
     assert answers.shape == (100, 2)
     found = np.arctan2(answers[:, 1], answers[:, 0].astype(np.float64))
     off = np.abs(np.angle(np.exp(1j * (found - trained.azimuths(test.delay_s)))))
-    # 1e-5 rad; equally good angles of a median may be told apart by the last bit: its grid is 0.25 degrees.
-    # An answer close to zero, as unscaled inputs give, turns by more for the same error of its components.
-    worst = {"forest-12-median": 0.009, "forest-24-median": 0.009, "siren-unscaled": 1e-3}
-    assert off.max() < worst.get(name, 1e-5)
+    off *= np.minimum(np.hypot(*answers.T), 1.0)  # to the error of the components, which an angle magnifies
+    # equally good angles of a median may be told apart by the last bit: its grid is 0.25 degrees
+    assert off.max() < (0.009 if name.endswith("median") else 1e-5)
 
 
 def test_installed_model_flies_by_its_name(tmp_path) -> None:
@@ -188,9 +187,12 @@ def test_least_squares_finds_plane_waves_from_everywhere() -> None:
 
 def test_minimiser_from_the_middle_agrees_with_the_flight_s_solver() -> None:
     s = with_twin(LabSettings(), rounding="none", position_error_m=0.0, range_m=2.0)
-    data = sample(s, 30, 4)
+    data = sample(s, 40, 4)
+    data = take(data, np.hypot(*data.position_m) > 0.2)  # outside the array, where the solver looks
     solved = flight(s, hyperbolic(s))(data.delay_s)
-    np.testing.assert_allclose(np.angle(np.exp(1j * (solved[0] - data.azimuth_rad))), 0.0, atol=1e-3)
+    wrong = np.abs(np.angle(np.exp(1j * (solved[0] - data.azimuth_rad))))
+    # two hyperbolas may cross twice: near the array a second place can explain the same two delays
+    assert np.quantile(wrong, 0.9) < 1e-5
     found = fixed_start(s, (0.0, 0.0))(data.delay_s)
     off = np.abs(np.angle(np.exp(1j * (found[0] - solved[0]))))
     # BFGS ends where the gradient is below 1e-5 m, some degrees early for a source that it has to walk to

@@ -1,4 +1,4 @@
-"""`locagen-lab paper --quick` writes everything, with sane numbers; the analysis of variance is a textbook's."""
+"""`locagen-lab paper --quick` writes everything, with sane numbers; the analysis of variance is sound."""
 
 from __future__ import annotations
 

@@ -118,6 +118,7 @@ def setup(s: LabSettings, scale: Scale) -> dict[str, Any]:
         "mlp": dataclasses.asdict(s.mlp),
         "siren": dataclasses.asdict(s.siren),
         "held_out": scale.held_out,
+        "quick": scale == QUICK,
         "seconds": {},
     }
 

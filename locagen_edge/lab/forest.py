@@ -93,10 +93,12 @@ class Forest:
 
     def _cost(self) -> F64:
         """(classes, candidates) mean |error| of each candidate for azimuths spread evenly over each bin."""
-        within = (np.arange(32) + 0.5) / 32 - 0.5
-        spread = self._centres[:, None] + within * (2.0 * np.pi / self.bins)
-        off = np.angle(np.exp(1j * (spread[:, :, None] - _candidates())))
-        cost: F64 = np.abs(off).mean(axis=1)
+        half = np.pi / self.bins
+        off = np.abs(np.angle(np.exp(1j * (self._centres[:, None] - _candidates()))))
+        # outside the bin the distance to its middle; inside it, and opposite, the mean of the two sides
+        inside = (half**2 + off**2) / (2.0 * half)
+        opposite = np.pi - (half**2 + (np.pi - off) ** 2) / (2.0 * half)
+        cost: F64 = np.where(off < half, inside, np.where(off > np.pi - half, opposite, off))
         return cost
 
     def to_onnx(self, features: Features, pairs: int) -> bytes:

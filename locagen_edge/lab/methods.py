@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -126,8 +127,8 @@ def train(name: str, s: LabSettings, data: Arrivals) -> Trained:
     return METHODS[name](s, data)
 
 
-def take(data: Arrivals, rows: slice) -> Arrivals:
-    """Some of the samples."""
+def take(data: Arrivals, rows: Any) -> Arrivals:
+    """Some of the samples, by a slice or a mask."""
     return Arrivals(
         data.delay_s[:, rows], data.true_delay_s[:, rows], data.position_m[:, rows], data.azimuth_rad[rows]
     )

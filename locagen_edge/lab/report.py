@@ -27,9 +27,11 @@ def _degrees(value: float | None) -> str:
 def _intro(result: dict[str, Any]) -> list[str]:
     s = result["setup"]
     twin = s["twin"]
+    quick = ["**A quick run: it shows that all parts work; its models have hardly learned.**", ""]
     return [
         "# The paper's experiments on the digital twin",
         "",
+        *(quick if s["quick"] else []),
         "Source: Kunwar, Cantor, Rizzo & Qayyum, *LocaGen: Sub-Sample Time-Delay Learning for Beam "
         "Localization*. No sound is simulated here: arrivals are computed, rounded to samples, and "
         "subtracted.",
@@ -64,7 +66,7 @@ def _by_rate(result: dict[str, Any]) -> list[str]:
             mae, best = row[name]["mae_deg"], row["best possible"]["mae_deg"]
             reached = name != "best possible" and mae <= best * (1 + NEAR)
             cells.append(f"**{mae:.2f}°**" if reached else f"{mae:.2f}°")
-        rows.append([label(name) + _reading(name), *cells, paper])
+        rows.append([label(name), *cells, paper])
     return [
         "## Error per method and sample rate",
         "",
@@ -97,17 +99,6 @@ def _by_rate(result: dict[str, Any]) -> list[str]:
         "",
         "![forest against triangulation](histogram.png)",
     ]
-
-
-def _reading(name: str) -> str:
-    readings = {"mean": ", mean direction", "median": ", median"}
-    ending = readings.get(name.rpartition("-")[2], "")
-    return "" if ending and ending in label(name) else _bins(name) + ending
-
-
-def _bins(name: str) -> str:
-    """What `label` leaves out of a name it does not know."""
-    return ", centre of the likeliest" if name in ("forest-12", "forest-24") else ""
 
 
 def _by_spacing(result: dict[str, Any]) -> list[str]:

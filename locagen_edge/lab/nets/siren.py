@@ -19,6 +19,7 @@ class Sine(torch.nn.Module):
         self.linear = torch.nn.Linear(inputs, outputs)
         self.omega = omega
         torch.nn.init.uniform_(self.linear.weight, -bound, bound)
+        torch.nn.init.uniform_(self.linear.bias, -bound, bound)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return torch.sin(self.omega * self.linear(x))
@@ -28,7 +29,8 @@ def siren(inputs: int, s: SirenSettings) -> torch.nn.Module:
     """`inputs` features to cosine and sine.
 
     The first layer's weights are uniform within 1 / inputs, the others' within sqrt(6 / width) / omega, so
-    that every sine's argument starts with the standard deviation 1 whatever the depth; the last is linear.
+    that every hidden sine's argument starts with the standard deviation 1 whatever the depth; biases within
+    the same bounds; the last layer is linear.
     """
     bound = math.sqrt(6.0 / s.width) / s.omega_hidden
     first = Sine(inputs, s.width, s.omega, 1.0 / inputs)
