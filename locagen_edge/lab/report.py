@@ -165,9 +165,9 @@ def _assumptions(result: dict[str, Any]) -> list[str]:
         "none, or noise, do not give 12 angles. Delays half as long do: with half the spacing (or half the "
         f"rate, or time in steps of two samples) there are {half['distinct_angles']} distinct angles, 30° "
         f"apart, and the best possible is {half['best_10k_deg']:.2f}° and {half['best_48k_deg']:.2f}°. That "
-        "the paper's 24 bins are worse than its 12 follows too: bins of 15° that begin at 0° have their edges on "
-        "the angles, and every answer is half a bin off. All of the paper's figures agree with an array "
-        "whose delays are half of a 10 cm triangle's; nothing here can tell where that factor comes from.",
+        "the paper's 24 bins are worse than its 12 follows too: bins of 15° that begin at 0° have their "
+        "edges on the angles, and every answer is half a bin off. All of the paper's figures agree with an "
+        "array whose delays are half of a 10 cm triangle's; nothing here can tell where that factor is from.",
         "",
         "The paper's triangulation, which its forest beats by "
         f"{paper['less_than_triangulation']:.0%} (so about "
