@@ -65,12 +65,22 @@ class ForestSettings:
 
     trees: int = setting(100, "Trees.", least=1, most=10000)
     leaf: int = setting(
-        20,
+        3,
         "Fewest samples in a leaf. A cell of whole-sample delays is one point for a tree, so a small leaf "
         "costs nothing there; without rounding it is what smooths.",
         unit="samples", least=1, most=10000,
     )  # fmt: skip
     depth: int = setting(24, "Deepest tree.", unit="levels", least=1, most=64)
+    samples_per_tree: int = setting(
+        100_000, "Samples that one tree sees at most.", unit="samples", least=10, most=100_000_000
+    )
+    bins_deg: float = setting(
+        0.0,
+        "Where the first azimuth bin begins. The paper does not say; its figures ask for -15 with 12 bins.",
+        unit="degrees",
+        least=-180,
+        most=180,
+    )
     seed: int = setting(1, "Of bootstraps and splits.", least=0, most=2**31 - 1)
 
 
@@ -81,7 +91,7 @@ class MlpSettings:
     width: int = setting(64, "Neurons in each hidden layer.", least=1, most=4096)
     layers: int = setting(2, "Hidden layers.", least=1, most=16)
     rate: float = setting(5e-3, "Highest learning rate of AdamW.", least=1e-7, most=1)
-    batch: int = setting(256, "Samples in a step.", unit="samples", least=1, most=1_000_000)
+    batch: int = setting(512, "Samples in a step.", unit="samples", least=1, most=1_000_000)
     epochs: int = setting(60, "Passes over the data at most.", least=1, most=10000)
     patience: int = setting(
         15, "Passes without a better validation error before it stops.", unit="passes", least=1, most=10000
@@ -105,7 +115,7 @@ class SirenSettings:
         1.0, "Factor inside the other sines; the weights start smaller by it.", least=0.01, most=10000
     )
     rate: float = setting(2e-3, "Highest learning rate of AdamW.", least=1e-7, most=1)
-    batch: int = setting(256, "Samples in a step.", unit="samples", least=1, most=1_000_000)
+    batch: int = setting(512, "Samples in a step.", unit="samples", least=1, most=1_000_000)
     epochs: int = setting(60, "Passes over the data at most.", least=1, most=10000)
     patience: int = setting(
         15, "Passes without a better validation error before it stops.", unit="passes", least=1, most=10000

@@ -19,6 +19,8 @@ import torch
 
 from locagen_edge.geometry import MicArray
 from locagen_edge.lab.export import install, to_onnx
+from locagen_edge.lab.nets.mlp import mlp
+from locagen_edge.lab.settings import MlpSettings
 from locagen_edge.models import default_directory
 from locagen_edge.settings import Settings
 from locagen_edge.types import F32, F64
@@ -28,6 +30,8 @@ LOWEST_DEG = -60.0
 ARRIVAL_NOISE = 0.01
 """1-sigma of each arrival as a share of the spacing: 3 us on 10 cm, about 10 dB SNR in one frame."""
 BATCH = 2048
+SHAPE = MlpSettings(width=32, layers=2)
+"""About 1,300 weights: the answer is smooth, and a call has to cost microseconds."""
 
 
 def samples(array: MicArray, count: int, noise: float, rng: np.random.Generator) -> tuple[F32, F64]:
@@ -44,24 +48,13 @@ def samples(array: MicArray, count: int, noise: float, rng: np.random.Generator)
     return delays.T.astype(np.float32), azimuth
 
 
-def network(pairs: int) -> torch.nn.Module:
-    """About 1,300 weights: the answer is smooth, and a call has to cost microseconds."""
-    return torch.nn.Sequential(
-        torch.nn.Linear(pairs, 32),
-        torch.nn.Tanh(),
-        torch.nn.Linear(32, 32),
-        torch.nn.Tanh(),
-        torch.nn.Linear(32, 2),
-    )
-
-
 def train(array: MicArray, seed: int, steps: int, progress: bool = False) -> torch.nn.Module:
     """The trained network. Same seed and steps, same weights on the same machine."""
     from tqdm import trange
 
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
-    model = network(len(array.pairs))
+    model = mlp(len(array.pairs), SHAPE)
     optimiser = torch.optim.AdamW(model.parameters(), lr=3e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=1e-2, total_steps=steps)
     bar = trange(steps, desc="training", unit="step", disable=not progress)

@@ -1,0 +1,228 @@
+"""The figures of the experiments, drawn from the plain numbers of report.json alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
+
+STYLES: dict[str, dict[str, Any]] = {
+    "best possible": {"color": "black", "linestyle": "-", "linewidth": 4.0, "alpha": 0.3},
+    "least squares": {"color": "tab:blue", "marker": "o"},
+    "hyperbolic": {"color": "tab:cyan", "marker": "s"},
+    "minimiser": {"color": "tab:red", "marker": "X"},
+    "forest-12": {"color": "tab:olive", "marker": "v"},
+    "forest-24": {"color": "tab:green", "marker": "^"},
+    "forest": {"color": "darkgreen", "marker": "D"},
+    "mlp": {"color": "tab:purple", "marker": "P"},
+    "siren": {"color": "tab:orange", "marker": "*", "linestyle": "--"},
+    "siren-unscaled": {"color": "tab:brown", "marker": "x", "linestyle": ":"},
+    "table of cells": {"color": "tab:blue", "marker": "o"},
+}
+LABELS = {
+    "hyperbolic": "hyperbolic solver (flight)",
+    "minimiser": "minimiser, fixed start",
+    "forest-12": "forest, 12 bins",
+    "forest-12-mean": "forest, 12 bins, mean direction",
+    "forest-12-median": "forest, 12 bins, median",
+    "forest-24": "forest, 24 bins",
+    "forest-24-mean": "forest, 24 bins, mean direction",
+    "forest-24-median": "forest, 24 bins, median",
+    "forest": "forest, regression",
+    "mlp": "MLP",
+    "siren": "SIREN",
+    "siren-unscaled": "SIREN, inputs unscaled",
+}
+SHOWN = (
+    "best possible", "least squares", "hyperbolic", "minimiser", "forest-12", "forest-24", "forest", "mlp",
+    "siren", "siren-unscaled",
+)  # fmt: skip
+PAPER: dict[str, Any] = {
+    "color": "black",
+    "marker": "*",
+    "markersize": 13,
+    "linestyle": "none",
+    "markerfacecolor": "gold",
+}
+
+
+def draw_all(result: dict[str, Any], folder: Path) -> None:
+    """Writes every figure as NAME.png."""
+    with matplotlib.rc_context({"figure.dpi": 120, "font.size": 9, "axes.grid": True, "grid.alpha": 0.3}):
+        for name, (function, size) in FIGURES.items():
+            figure, axes = plt.subplots(figsize=size, layout="constrained")
+            function(axes, result)
+            figure.savefig(folder / f"{name}.png", metadata={"Software": None})
+            plt.close(figure)
+
+
+def label(name: str) -> str:
+    return LABELS.get(name, name)
+
+
+def _plain(axis: Any) -> None:
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def histogram(axes: Axes, result: dict[str, Any]) -> None:
+    data = result["distribution"]
+    edges = np.array(data["edges_deg"])
+    rows = result["by_rate"].get(str(result["setup"]["rate_hz"]), {})
+    for name, share in data["histogram"].items():
+        style = STYLES[name]
+        mae = f", mean {rows[name]['mae_deg']:.1f}°" if name in rows else ""
+        axes.stairs(
+            100 * np.array(share), edges, color=style["color"], label=label(name) + mae, linewidth=1.6
+        )
+    axes.set(
+        xlabel="|azimuth error| (degrees)",
+        ylabel="share of samples per 2 degrees (%)",
+        yscale="log",
+        ylim=(0.02, 60),
+        xlim=(0, 180),
+        title=f"Forest against triangulation, {result['setup']['rate_hz'] / 1000:g} kHz, "
+        f"{100 * result['setup']['spacing_m']:g} cm",
+    )
+    _plain(axes.yaxis)
+    axes.legend()
+
+
+def cdf(axes: Axes, result: dict[str, Any]) -> None:
+    data = result["distribution"]
+    for name in SHOWN:
+        style = {k: v for k, v in STYLES[name].items() if k != "marker"}
+        axes.plot(np.maximum(data["cdf_deg"][name], 1e-2), data["percent"], label=label(name), **style)
+    axes.set(
+        xlabel="|azimuth error| (degrees)",
+        ylabel="share of samples with a smaller error (%)",
+        xscale="log",
+        xlim=(0.05, 180),
+        ylim=(0, 100),
+        title="Distribution of the error at 48 kHz, 10 cm",
+    )
+    axes.set_xticks([0.1, 0.3, 1, 3, 10, 30, 100])
+    _plain(axes.xaxis)
+    axes.legend(loc="upper left")
+
+
+def rates(axes: Axes, result: dict[str, Any]) -> None:
+    data = result["by_rate"]
+    khz = np.array([int(rate) for rate in data]) / 1000
+    for name in SHOWN:
+        axes.plot(khz, [row[name]["mae_deg"] for row in data.values()], label=label(name), **STYLES[name])
+    told = [
+        (int(rate) / 1000, value)
+        for rate, values in result["paper"]["mae_deg"].items()
+        for value in values.values()
+    ]
+    axes.plot(*zip(*told, strict=True), label="the paper's own figures", **PAPER)
+    axes.set(
+        xlabel="sample rate (kHz)",
+        ylabel="mean |azimuth error| (degrees)",
+        xscale="log",
+        yscale="log",
+        title=f"Error over sample rate, {100 * result['setup']['spacing_m']:g} cm",
+    )
+    axes.set_xticks(khz, [f"{k:g}" if k != 44.1 else "44.1  " for k in khz])
+    axes.set_yticks([1, 2, 5, 10, 20, 50, 100])
+    _plain(axes.yaxis)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def spacings(axes: Axes, result: dict[str, Any]) -> None:
+    data = result["by_spacing"]
+    cm = np.array([float(d) for d in data]) * 100
+    for name in [name for name in SHOWN if name in next(iter(data.values()))]:
+        axes.plot(cm, [row[name]["mae_deg"] for row in data.values()], label=label(name), **STYLES[name])
+    axes.set(
+        xlabel="spacing of the microphones (cm)",
+        ylabel="mean |azimuth error| (degrees)",
+        xscale="log",
+        yscale="log",
+        title=f"Error over spacing, {result['setup']['rate_hz'] / 1000:g} kHz",
+    )
+    axes.set_xticks(cm)
+    axes.set_yticks([0.5, 1, 2, 5, 10, 20, 50])
+    _plain(axes.xaxis)
+    _plain(axes.yaxis)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _offset_map(axes: Axes, result: dict[str, Any], name: str) -> None:
+    data = result["offsets"]
+    levels, error = np.array(data["levels_samples"]), data["errors"][name]
+    image = axes.pcolormesh(levels, levels, np.array(error["mean"]).T, cmap="viridis", shading="nearest")
+    p = error["p"]
+    axes.figure.colorbar(image, ax=axes, label=f"mean error ({error['unit']})")
+    axes.grid(visible=False)
+    axes.set(
+        xlabel="offset of microphone 1 (samples)",
+        ylabel="offset of microphone 2 (samples)",
+        title=f"Error in {name}\np = {p[0]:.2g} (microphone 1), {p[1]:.2g} (2)",
+        aspect="equal",
+    )
+
+
+def offsets_position(axes: Axes, result: dict[str, Any]) -> None:
+    _offset_map(axes, result, "position, minimiser")
+
+
+def offsets_azimuth(axes: Axes, result: dict[str, Any]) -> None:
+    _offset_map(axes, result, "azimuth")
+
+
+def times(axes: Axes, result: dict[str, Any]) -> None:
+    data = dict(sorted(result["times"].items(), key=lambda item: -item[1]["median_us"]))
+    medians = [row["median_us"] for row in data.values()]
+    to_p99 = [max(row["p99_us"] - row["median_us"], 0.0) for row in data.values()]
+    axes.barh(list(data), medians, color="tab:blue", xerr=[[0.0] * len(data), to_p99], ecolor="tab:red")
+    for at, value in enumerate(medians):
+        axes.annotate(f"{value:.0f} µs", (value, at), xytext=(-4, 0), textcoords="offset points",
+                      ha="right", va="center", color="white")  # fmt: skip
+    axes.set(
+        xlabel="wall-clock time of one estimate (µs), median; red: to the 99th percentile",
+        xscale="log",
+        xlim=(10, None),
+        title="Time per estimate on the machine that wrote this report",
+    )
+    axes.grid(visible=False, axis="y")
+
+
+def learning(axes: Axes, result: dict[str, Any]) -> None:
+    data = result["learning"]
+    for name, mae in data["mae_deg"].items():
+        axes.plot(data["samples"], mae, label=label(name), **STYLES[name])
+    axes.axhline(data["best_deg"], label="best possible", **STYLES["best possible"])
+    axes.set(
+        xlabel="training samples",
+        ylabel="mean |azimuth error| (degrees)",
+        xscale="log",
+        yscale="log",
+        title=f"Learning curve, {data['rate_hz'] / 1000:g} kHz",
+    )
+    axes.set_yticks([1.5, 2, 3, 4, 5, 7, 10])
+    _plain(axes.yaxis)
+    axes.legend()
+
+
+FIGURES: dict[str, tuple[Callable[[Axes, dict[str, Any]], None], tuple[float, float]]] = {
+    "histogram": (histogram, (7, 4.2)),
+    "cdf-48khz": (cdf, (7, 4.5)),
+    "mae-by-rate": (rates, (8.5, 5)),
+    "mae-by-spacing": (spacings, (8.5, 4.5)),
+    "offsets-position": (offsets_position, (5.5, 4.5)),
+    "offsets-azimuth": (offsets_azimuth, (5.5, 4.5)),
+    "time": (times, (7, 3.8)),
+    "learning": (learning, (7, 4.2)),
+}
+"""Name, drawing, size in inches."""
