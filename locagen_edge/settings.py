@@ -374,7 +374,7 @@ def _faults_of_value(value: Any, meta: Any) -> Iterator[str]:
 def _faults_between_fields(s: Settings) -> Iterator[str]:
     yield from _faults_of_array(s)
     yield from _faults_of_link(s)
-    if s.daemon.stall_s < 2 * s.hop_s:
+    if s.audio.rate_hz > 0 and s.daemon.stall_s < 2 * s.hop_s:
         yield f"daemon.stall_s: {s.daemon.stall_s:g} s is less than two hops ({2 * s.hop_s:.3g} s)"
     if s.audio.frame & (s.audio.frame - 1):
         yield f"audio.frame: {s.audio.frame} is not a power of two"
