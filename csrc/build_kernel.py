@@ -22,7 +22,7 @@ CFLAGS = [
     "-Wall",
     "-Wextra",
 ]
-SOURCES = ["gcc_phat.c", "fft.c", "frame_quad.c", "frame_avx2.c"]
+SOURCES = ["gcc_phat.c", "fft.c", "spectrum.c", "frame_quad.c", "frame_avx2.c"]
 HEADERS = ["locagen.h", "gcc_phat.h", "fft.h", "lanes.h", "fft_passes.h", "frame_path.h"]
 
 header = (HERE / "locagen.h").read_text(encoding="utf-8")
