@@ -26,13 +26,16 @@ static const double THIN_PHASE = 0.15;
  * grid's own step is to be bridged, at last as narrow as float's rounding of the scores allows. */
 static const double WIDTHS[] = {0.6, 0.4, 0.2, 0.2};
 
+static const double LOBE = 3.0;  /* radians of phase from a lobe's top to beyond its foot */
+static const float CLOSE = 0.9f; /* the grid's steps and added bins cost a lobe less than a tenth of its score */
+
 static const double LOST = 0.1;          /* a microphone missing from more of R does not count */
 static const double SILENT = 1e-5;       /* power under the loudest one's: -50 dB */
 static const float LEAST_DENOMINATOR = 1e-6f; /* of microphones: loading keeps the true ones above it */
 static const float LEAST_AFTER_NULL = 0.05f;  /* nearer to a nulled source nothing can be told */
 static const double WHITE_SHARE = 1e-7;  /* the least level of noise that is estimated, of the signal: float's own */
 
-enum { MOST_THINNING = 8, LEAST_COARSE = 8 };
+enum { MOST_THINNING = 8, LEAST_COARSE = 8, MOST_LOBES = 4 };
 
 static steer *state_of(const void *memory)
 {
@@ -373,13 +376,33 @@ static int usable_mics(const steer *s)
     return s->heard > 0 && count >= 2 ? mask : 0;
 }
 
-static int best_on_grid(steer *s, enum locagen_measure measure)
+static void score_grid(const steer *s, enum locagen_measure measure)
 {
-    int count = s->azimuths * s->elevations, groups = (count + DIRECTIONS - 1) / DIRECTIONS, best = 0;
+    int groups = (s->azimuths * s->elevations + DIRECTIONS - 1) / DIRECTIONS;
     s->paths->score(s, &s->coarse, measure, s->grid, groups, s->scores, s->scores + (long)groups * DIRECTIONS);
-    for (int n = 1; n < count; n++)
-        if (s->scores[n] > s->scores[best])
+}
+
+/* Whether the lobe of one direction of the grid may hold the other. */
+static int same_lobe(const steer *s, int i, int j)
+{
+    const double *u = s->grid_u + 3 * i, *v = s->grid_u + 3 * j;
+    double d[3] = {u[0] - v[0], u[1] - v[1], u[2] - v[2]}, across = s->flat ? dot(d, s->axes[2]) : 0;
+    return s->reach * sqrt(fmax(0, dot(d, d) - across * across)) < LOBE;
+}
+
+/* The best direction of the grid outside the lobes of those before it. */
+static int next_on_grid(const steer *s, const int *before, int count_before)
+{
+    int best = -1;
+    for (int n = 0; n < s->azimuths * s->elevations; n++) {
+        if (best >= 0 && !(s->scores[n] > s->scores[best]))
+            continue;
+        int apart = 1;
+        for (int i = 0; i < count_before && apart; i++)
+            apart = !same_lobe(s, n, before[i]);
+        if (apart)
             best = n;
+    }
     return best;
 }
 
@@ -426,7 +449,7 @@ static void newton(const double g[2], const double h[3], double most, double ste
 }
 
 /* One Newton step from scores at the corners of a hexagon of half width h and its middle. */
-static void refine_once(steer *s, enum locagen_measure measure, double h, aim *a)
+static void refine_once(const steer *s, enum locagen_measure measure, double h, aim *a)
 {
     static const double AT[DIRECTIONS][2] = {{0, 0}, {1, 0}, {-1, 0}, {0, 1}, {0, -1}, {1, 1}, {-1, -1}, {0, 0}};
     float score[DIRECTIONS], mean_q[DIRECTIONS];
@@ -476,11 +499,24 @@ static void refine_once(steer *s, enum locagen_measure measure, double h, aim *a
     a->mean_q = (double)mean_q[0];
 }
 
-static void refine(steer *s, enum locagen_measure measure, int best, aim *a)
+/* The best direction of all. The grid may put lobes in a wrong order that differ by less than it loses
+ * beside a lobe's top: then several are refined. Returns 0 where nothing scores. */
+static int find_best(const steer *s, enum locagen_measure measure, aim *best)
 {
-    memcpy(a->u, s->grid_u + 3 * best, sizeof a->u);
-    for (size_t n = 0; n < sizeof WIDTHS / sizeof *WIDTHS; n++)
-        refine_once(s, measure, WIDTHS[n] / s->reach, a);
+    int top[MOST_LOBES], lobes = 0;
+    score_grid(s, measure);
+    for (; lobes < MOST_LOBES; lobes++) {
+        top[lobes] = next_on_grid(s, top, lobes);
+        if (top[lobes] < 0 || !(s->scores[top[lobes]] > CLOSE * s->scores[top[0]]))
+            break;
+        aim a;
+        memcpy(a.u, s->grid_u + 3 * top[lobes], sizeof a.u);
+        for (size_t n = 0; n < sizeof WIDTHS / sizeof *WIDTHS; n++)
+            refine_once(s, measure, WIDTHS[n] / s->reach, &a);
+        if (lobes == 0 || a.score > best->score)
+            *best = a;
+    }
+    return lobes > 0 && best->score > 0;
 }
 
 /* How R_n is to be had; where it was never learnt, its level from the power across the direction of most power. */
@@ -499,8 +535,8 @@ static locagen_whitening whitening(steer *s)
     for (int k = 0; k < s->bins; k++)
         total += (double)s->fine.planes[k];
     aim a;
-    refine(s, MEASURE_POWER, best_on_grid(s, MEASURE_POWER), &a);
-    double across = (total - a.score) / (s->bins * ((double)count - 1));
+    double along = find_best(s, MEASURE_POWER, &a) ? a.score : 0;
+    double across = (total - along) / (s->bins * ((double)count - 1));
     how.white = (float)fmax(fmax(across, WHITE_SHARE * total / s->bins), (double)s->floor);
     return how;
 }
@@ -557,12 +593,8 @@ int locagen_steer_search(locagen_steer *memory, int32_t most, locagen_source *ou
     int count = __builtin_popcount((unsigned)how.mics), found = 0;
     for (; found < most && found < count - 1; found++) {
         s->paths->whiten(s, &how);
-        int best = best_on_grid(s, MEASURE_RATIO);
-        if (!(s->scores[best] > 0.0f))
-            break;
         aim a;
-        refine(s, MEASURE_RATIO, best, &a);
-        if (!(a.score > 0))
+        if (!find_best(s, MEASURE_RATIO, &a))
             break;
         out[found] = told(&a, looks(s), how.mics);
         add_null(s, found, a.u);
@@ -640,7 +672,7 @@ int locagen_steer_map(locagen_steer *memory, float *map)
     }
     locagen_whitening how = whitening(s);
     s->paths->whiten(s, &how);
-    best_on_grid(s, MEASURE_RATIO);
+    score_grid(s, MEASURE_RATIO);
     for (int n = 0; n < count; n++)
         map[n] = (float)looks(s) * s->scores[n];
     return LOCAGEN_OK;
