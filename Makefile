@@ -83,6 +83,7 @@ build/test_kernel: csrc/test_kernel.c $(KERNEL_C) $(wildcard csrc/*.h)
 bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(call need,libfftw3-dev,comparing with FFTW)
 	$(BIN)/python bench/bench_kernel.py
+	$(BIN)/python bench/bench_steered.py
 	$(BIN)/python bench/bench_pipeline.py
 
 .PHONY: models

@@ -147,7 +147,7 @@ int locagen_steer_learn(locagen_steer *state, float share);
 int locagen_steer_hear(locagen_steer *state, float share);
 
 /* Looks for up to `most` sources in R_x, strongest first; each is nulled (in whitened space) before the next is
- * looked for. Returns how many `out` holds: none before hear, in silence or with less than two microphones; at most
+ * looked for, and at last the directions of those that are clearly more than noise are refined with each other nulled. Returns how many `out` holds: none before hear, in silence or with less than two microphones; at most
  * one less than there are microphones. A state that never learnt takes the noise for white, and its level from what
  * R_x holds across its best direction (M - 1 of M dimensions). */
 int locagen_steer_search(locagen_steer *state, int32_t most, locagen_source *out);

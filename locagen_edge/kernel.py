@@ -172,6 +172,11 @@ class Steered:
     Raises:
         KernelError: the configuration is none that the kernel can do; the text names the fault.
 
+    Attributes:
+        first_bin: number of the band's first bin.
+        frequency_hz: of each bin in the band, float64, shape `(bins,)`.
+        elevation_rad, azimuth_rad: axes of the map, float32.
+
     One object serves one thread.
     """
 
@@ -262,11 +267,11 @@ class Steered:
         return self._power.copy(), bad
 
     def learn(self, share: float) -> None:
-        """Puts the frame into the noise's matrix with this weight, 0 to 1: R <- (1 - share) R + share x x^H."""
+        """Puts the frame into the noise's matrix: R <- (1 - share) R + share x x^H, share 0 to 1."""
         _check(lib.locagen_steer_learn(self._state, share))
 
     def hear(self, share: float = 1.0) -> None:
-        """Puts the frame into the signal's matrix with this weight, 0 to 1; 1: this frame alone."""
+        """The same for the signal's matrix; 1: this frame alone."""
         _check(lib.locagen_steer_hear(self._state, share))
 
     def search(self, max_sources: int = 1) -> tuple[Source, ...]:
@@ -283,7 +288,10 @@ class Steered:
         )
 
     def map(self) -> npt.NDArray[np.float32]:
-        """Scores on the coarse grid, float32, shape `(elevations, azimuths)`: `elevation_rad`, `azimuth_rad`."""
+        """Scores on the coarse grid, float32, shape `(elevations, azimuths)`.
+
+        Its axes are `elevation_rad` and `azimuth_rad`.
+        """
         scores = np.empty(self._grid, _FLOAT32)
         _check(lib.locagen_steer_map(self._state, ffi.from_buffer(_FLOATS, scores)))
         return scores

@@ -1,6 +1,6 @@
 """Laws of the steered search: what it computes, what it finds, how well, and what it does with bad input.
 
-The float64 reference is `reference_steered.py`. Fields are simulated exactly: plane waves delayed in frequency.
+The float64 reference is `reference_steered.py`. Fields are exact: plane waves delayed in frequency.
 """
 
 import math
@@ -124,7 +124,7 @@ def test_agrees_with_the_reference(configuration: tuple[np.ndarray, dict[str, An
     score = reference.at(signal, loaded, best.azimuth_rad, best.elevation_rad)
     # float32 through two inverses; a null as deep as the loading loses that much of its digits.
     assert best.score == pytest.approx(score, rel=2e-3)
-    # No direction of many is better, neither near nor far. The last step of Newton's is worth next to nothing.
+    # No direction of many is better, neither near nor far, by more than Newton's last step is worth.
     for _ in range(100):
         azimuth, elevation = rng.uniform(0, 2 * np.pi), math.asin(rng.uniform(-1, 0))
         assert reference.at(signal, loaded, azimuth, elevation) <= score * 1.002 + 0.1
@@ -165,7 +165,7 @@ def test_the_map_is_the_score_on_its_grid(seed: int, positions: np.ndarray) -> N
 def test_signs_and_angles(azimuth_deg: float, elevation_deg: float) -> None:
     """A microphone nearer to the source hears earlier; FRD, clockwise, elevation positive up."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-    for positions in (TRIANGLE, PYRAMID, TRIANGLE + [1.0, -2.0, 0.5]):
+    for positions in (TRIANGLE, PYRAMID, TRIANGLE + np.array([1.0, -2.0, 0.5])):
         rng = np.random.default_rng(5)
         samples = wave(rng, azimuth, elevation, positions) + hiss(rng, len(positions), 0.001)
         (source,) = heard(steered(positions), samples)
@@ -278,9 +278,10 @@ def test_a_strong_interferer_is_whitened_away() -> None:
 
 
 def test_two_sources() -> None:
-    """The first is biased by the second, up to some degrees: nulling is no joint fit."""
+    """Their directions are fitted together, their scores are those of one after the other."""
     rng = np.random.default_rng(7)
-    for trial in range(20):
+    errors = []
+    for _ in range(20):
         first = rng.uniform(0, 2 * math.pi)
         second = first + rng.uniform(1.4, 2 * math.pi - 1.4)
         found = steered()
@@ -288,12 +289,30 @@ def test_two_sources() -> None:
         samples = wave(rng, first, -0.5) + wave(rng, second, -0.4, level=0.06) + hiss(rng)
         sources = heard(found, samples, 5)
         assert len(sources) == 2
-        assert abs(wrap(sources[0].azimuth_rad - first)) < math.radians(12), trial
-        assert abs(wrap(sources[1].azimuth_rad - second)) < math.radians(20), trial
-        assert sources[0] == found.search(1)[0]
+        errors.append((abs(wrap(sources[0].azimuth_rad - first)), abs(wrap(sources[1].azimuth_rad - second))))
+        assert sources[0].score == found.search(1)[0].score
         # The second alone: what nulling leaves of the first, and noise.
         (only, rest) = heard(found, wave(rng, first, -0.5) + hiss(rng), 2)
         assert rest.score < 0.02 * only.score
+    # 20 and 16 dB over the hiss: measured medians 0.07 and 0.1 degrees. The worst is about 0.5.
+    assert (np.degrees(np.median(errors, axis=0)) < 0.2).all()
+    assert np.degrees(np.max(errors)) < 2
+
+
+@pytest.mark.parametrize("snr_db", [0, 10, 20, 30, 40])
+def test_asking_for_a_second_source_harms_the_first_little(snr_db: int) -> None:
+    rng = np.random.default_rng(21)
+    level = 0.1 * 10 ** (-snr_db / 20)
+    errors: dict[int, list[float]] = {1: [], 2: []}
+    found = steered()
+    learn(found, [hiss(rng, level=level) for _ in range(100)])
+    for _ in range(50):
+        azimuth = rng.uniform(0, 2 * math.pi)
+        heard(found, wave(rng, azimuth, -0.5) + hiss(rng, level=level))
+        for most, values in errors.items():
+            values.append(abs(wrap(found.search(most)[0].azimuth_rad - azimuth)))
+    # Mostly to the last bit; a few times of fifty the second is taken for sure.
+    assert np.mean(errors[2]) <= 1.3 * np.mean(errors[1])
 
 
 def test_silence_and_what_was_learnt_from_it() -> None:
@@ -509,7 +528,9 @@ def test_elevation_and_its_sigma(snr_db: int, positions: np.ndarray) -> None:
         samples = wave(rng, azimuth, elevation, positions) + hiss(rng, len(positions), level)
         (source,) = heard(found, samples)
         sigma = source.sigma_rad()
-        shares.append((wrap(source.azimuth_rad - azimuth) / sigma[0], (source.elevation_rad - elevation) / sigma[1]))
+        shares.append(
+            (wrap(source.azimuth_rad - azimuth) / sigma[0], (source.elevation_rad - elevation) / sigma[1])
+        )
     within = (np.abs(shares) < 1).mean(axis=0)
     assert (within >= 0.60).all()
     assert (within <= 0.76).all()
