@@ -22,7 +22,8 @@ STEP void to_planes(const steer *s)
     }
 }
 
-/* R <- keep R + share x x^H, of the microphones in the frame; the others' numbers fade as if they were silent. */
+/* R <- keep R + share x x^H, of the microphones in the frame; the others' numbers fade as if they were
+ * silent. */
 STEP void add_frame(const steer *s, float keep, float share, float *matrix)
 {
     long stride = s->stride;
@@ -67,7 +68,8 @@ INLINE vec larger(vec a, vec b)
     return (vec)((mask & (ivec)a) | (~mask & (ivec)b));
 }
 
-/* A full Hermitian matrix of one vector of bins, without the rows and columns of microphones that do not count. */
+/* A full Hermitian matrix of one vector of bins, without the rows and columns of microphones that do not
+ * count. */
 INLINE void fetch_matrix(const int M, const steer *s, const float *planes, float scale, int mics, long k,
                          cvec a[MOST_MICS][MOST_MICS])
 {
@@ -151,8 +153,8 @@ INLINE void null_source(const int M, const steer *s, int source, long k, cvec g[
         }
 }
 
-/* Fills the fine response: numerator and denominator of q, both over the mean diagonal of G, so that neighbouring
- * bins may be added up. */
+/* Fills the fine response: numerator and denominator of q, both over the mean diagonal of G, so that
+ * neighbouring bins may be added up. */
 INLINE void whiten_bins(const int M, const steer *s, const locagen_whitening *how)
 {
     long stride = s->stride;

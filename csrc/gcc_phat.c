@@ -110,14 +110,16 @@ static void lay_out(state *s, const locagen_gcc_config *c, locagen_arena *a)
     choose_products(s);
 
     s->decimation = choose_decimation(c);
-    s->coarse = s->decimation == 1 ? (s->spectrum.last_bin | 1) - (s->spectrum.first_bin & ~1) + 1
-                                   : s->spectrum.last_bin / s->decimation - s->spectrum.first_bin / s->decimation + TAPS;
+    int first = s->spectrum.first_bin, last = s->spectrum.last_bin;
+    s->coarse = s->decimation == 1 ? (last | 1) - (first & ~1) + 1
+                                   : last / s->decimation - first / s->decimation + TAPS;
     s->half = s->lags < BLOCK_HALF ? s->lags : BLOCK_HALF;
     s->blocks = 2 * ((s->lags + BLOCK_HALF) / (2 * BLOCK_HALF + 1)) + 1;
     s->table_lags = (s->half + 16) / 16 * 16;
 
     s->weights = locagen_take(a, 4 * TAPS * (size_t)s->decimation);
-    s->coarse_re = locagen_take(a, 4 * (size_t)s->coarse), s->coarse_im = locagen_take(a, 4 * (size_t)s->coarse);
+    s->coarse_re = locagen_take(a, 4 * (size_t)s->coarse);
+    s->coarse_im = locagen_take(a, 4 * (size_t)s->coarse);
     s->table = locagen_take(a, 2 * (size_t)s->coarse * (size_t)s->table_lags);
     s->start = locagen_take(a, 2 * (size_t)s->coarse), s->step = locagen_take(a, 2 * (size_t)s->coarse);
     s->gain = locagen_take(a, 2 * (size_t)s->lags + 1);
@@ -247,7 +249,7 @@ const char *locagen_strerror(int code)
     case LOCAGEN_E_NOISE:
         return "noise: loading must be 1e-5 to 1, floor 1e-15 to 1";
     case LOCAGEN_E_ARRAY:
-        return "array: positions must be finite, within 10 m and not all in one place, speed of sound 100 to 2000 m/s";
+        return "array: positions must lie within 10 m, not all in one place; speed of sound 100 to 2000 m/s";
     case LOCAGEN_E_GRID:
         return "grid: must have 8 to 720 azimuths and 2 to 180 elevations";
     case LOCAGEN_E_SHARE:

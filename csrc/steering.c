@@ -1,15 +1,15 @@
 /* steering.c - maximum likelihood over directions: set-up, memory of frames, coarse grid, refinement.
  *
- * What is scored and why stands in locagen.h. How it is made cheap: all of a coarse grid's directions are scored
- * on bins added up by the few (up to eight, as long as no phase across the array differs by more than THIN_PHASE
- * from that of their middle), and q is averaged over as many neighbours as it would be on the fine bins. From the
- * best one Newton's method goes on to the continuum, on all bins: eight directions are scored side by side, which is just
- * what finite differences of a parabola in two dimensions take.
+ * What is scored and why stands in locagen.h. How it is made cheap: all of a coarse grid's directions are
+ * scored on bins added up by the few (up to eight, as long as no phase across the array differs by more than
+ * THIN_PHASE from that of their middle), and q is averaged over as many neighbours as it would be on the
+ * fine bins. From the best one Newton's method goes on to the continuum, on all bins: eight directions are
+ * scored side by side, which is just what finite differences of a parabola in two dimensions take.
  *
- * Newton's coordinates are direction cosines in the plane of a flat array: the score is nearly a parabola in them, and
- * they know neither rim nor pole. Beyond the rim (noise may put the best there) the best on it is
- * taken. Of two directions that a flat array cannot tell apart the lower one is meant. An array in space has the two
- * arcs of the tangent plane for coordinates.
+ * Newton's coordinates are direction cosines in the plane of a flat array: the score is nearly a parabola in
+ * them, and they know neither rim nor pole. Beyond the rim (noise may put the best there) the best on it is
+ * taken. Of two directions that a flat array cannot tell apart the lower one is meant. An array in space has
+ * the two arcs of the tangent plane for coordinates.
  */
 #include "steering.h"
 
@@ -22,18 +22,18 @@ static const double PI = 3.14159265358979323846;
 /* 0.15 radians at the outer bins of a block lower their mean by 0.4 % and do not shift it. */
 static const double THIN_PHASE = 0.15;
 
-/* Half widths of the parabola through the scores, as phase across the array at the band's upper end: wide where the
- * grid's own step is to be bridged, at last as narrow as float's rounding of the scores allows. */
+/* Half widths of the parabola through the scores, as phase across the array at the band's upper end: wide
+ * where the grid's own step is to be bridged, at last as narrow as float's rounding of the scores allows. */
 static const double WIDTHS[] = {0.6, 0.4, 0.2, 0.2};
 
 static const double LOBE = 3.0;  /* radians of phase from a lobe's top to beyond its foot */
-static const float CLOSE = 0.9f; /* the grid's steps and added bins cost a lobe less than a tenth of its score */
+static const float CLOSE = 0.9f; /* the grid costs a lobe less than a tenth of its score */
 
 static const double LOST = 0.1;          /* a microphone missing from more of R does not count */
 static const double SILENT = 1e-5;       /* power under the loudest one's: -50 dB */
 static const float LEAST_DENOMINATOR = 1e-6f; /* of microphones: loading keeps the true ones above it */
 static const float LEAST_AFTER_NULL = 0.05f;  /* nearer to a nulled source nothing can be told */
-static const double WHITE_SHARE = 1e-7;  /* the least level of noise that is estimated, of the signal: float's own */
+static const double WHITE_SHARE = 1e-7;  /* of the signal, the least noise that is estimated: float's own */
 
 enum { MOST_THINNING = 8, LEAST_COARSE = 8, MOST_LOBES = 4 };
 
@@ -139,7 +139,8 @@ static void find_plane(steer *s, const locagen_steer_config *c)
         s->flat &= fabs(dot(arm[m], z)) <= 1e-3;
 }
 
-static void lay_out_response(locagen_response *r, const steer *s, int bins, int half, int weight, locagen_arena *a)
+static void lay_out_response(locagen_response *r, const steer *s, int bins, int half, int weight,
+                             locagen_arena *a)
 {
     r->bins = bins;
     r->stride = (bins + BIN_BLOCK - 1) / BIN_BLOCK * BIN_BLOCK;
@@ -176,12 +177,14 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
         }
     s->reach = per_metre * longest * s->spectrum.last_bin;
     int thinning = 1;
-    while (thinning < MOST_THINNING && 2 * thinning <= (2 * c->smooth_bins + 1) &&
-           s->bins / (2 * thinning) >= LEAST_COARSE && (2 * thinning - 1) / 2.0 * per_metre * longest < THIN_PHASE)
+    while (thinning < MOST_THINNING && 2 * thinning <= 2 * c->smooth_bins + 1 &&
+           s->bins / (2 * thinning) >= LEAST_COARSE &&
+           (2 * thinning - 1) / 2.0 * per_metre * longest < THIN_PHASE)
         thinning *= 2;
 
     size_t planes = (size_t)(s->mics * s->mics) * (size_t)s->stride, mics = (size_t)s->mics;
-    s->bins_re = locagen_take(a, mics * (size_t)s->stride), s->bins_im = locagen_take(a, mics * (size_t)s->stride);
+    s->bins_re = locagen_take(a, mics * (size_t)s->stride);
+    s->bins_im = locagen_take(a, mics * (size_t)s->stride);
     s->noise = locagen_take(a, planes), s->signal = locagen_take(a, planes);
     lay_out_response(&s->fine, s, s->bins, c->smooth_bins, 1, a);
     /* As many bins in the average: 2 half + 1 blocks nearest to 2 smooth_bins + 1 bins. */
@@ -241,10 +244,10 @@ static void fill_grid(steer *s)
     }
 }
 
-/* A look is a bin of an untapered frame. Tapering makes neighbouring bins depend on each other, overlap neighbouring
- * frames (Welch 1967, "The use of fast Fourier transform for the estimation of power spectra"): the variance
- * of an average is over sum(w^2)^2 / (N sum(w^4)) looks in a frame, and the coherence of windows h apart is
- * (sum(w(n) w(n + h)) / sum(w^2))^2. */
+/* A look is a bin of an untapered frame. Tapering makes neighbouring bins depend on each other, overlap
+ * neighbouring frames (Welch 1967, "The use of fast Fourier transform for the estimation of power spectra"):
+ * the variance of an average is over sum(w^2)^2 / (N sum(w^4)) looks in a frame, and the coherence of
+ * windows h apart is (sum(w(n) w(n + h)) / sum(w^2))^2. */
 static void count_looks(steer *s, const locagen_steer_config *c)
 {
     double squares = 0, fourths = 0;
@@ -256,7 +259,8 @@ static void count_looks(steer *s, const locagen_steer_config *c)
     for (int hop = 1; c->hop > 0 && hop <= 8 && hop * c->hop < c->frame; hop++, s->hops++) {
         double sum = 0;
         for (int n = 0; n + hop * c->hop < c->frame; n++)
-            sum += locagen_window(n, c->frame, c->taper) * locagen_window(n + hop * c->hop, c->frame, c->taper);
+            sum += locagen_window(n, c->frame, c->taper) *
+                   locagen_window(n + hop * c->hop, c->frame, c->taper);
         s->overlap[hop - 1] = sum * sum / (squares * squares);
     }
 }
@@ -357,7 +361,8 @@ int locagen_steer_hear(locagen_steer *memory, float share)
     double keep = 1.0f - share, with_old = 0;
     for (int hop = 0; hop < s->hops; hop++)
         with_old += s->overlap[hop] * keep * s->heard_weights[hop];
-    s->heard_variance = keep * keep * s->heard_variance + (double)share * share + 2 * (double)share * with_old;
+    double fresh = (double)share;
+    s->heard_variance = keep * keep * s->heard_variance + fresh * fresh + 2 * fresh * with_old;
     for (int hop = 7; hop > 0; hop--)
         s->heard_weights[hop] = keep * s->heard_weights[hop - 1];
     s->heard_weights[0] = share;
@@ -379,7 +384,8 @@ static int usable_mics(const steer *s)
 static void score_grid(const steer *s, enum locagen_measure measure)
 {
     int groups = (s->azimuths * s->elevations + DIRECTIONS - 1) / DIRECTIONS;
-    s->paths->score(s, &s->coarse, measure, s->grid, groups, s->scores, s->scores + (long)groups * DIRECTIONS);
+    float *mean_q = s->scores + (long)groups * DIRECTIONS; /* nobody reads it */
+    s->paths->score(s, &s->coarse, measure, s->grid, groups, s->scores, mean_q);
 }
 
 /* Whether the lobe of one direction may hold the other. */
@@ -450,7 +456,9 @@ static void newton(const double g[2], const double h[3], double most, double ste
 /* One Newton step from scores at the corners of a hexagon of half width h and its middle. */
 static void refine_once(const steer *s, enum locagen_measure measure, double h, aim *a)
 {
-    static const double AT[DIRECTIONS][2] = {{0, 0}, {1, 0}, {-1, 0}, {0, 1}, {0, -1}, {1, 1}, {-1, -1}, {0, 0}};
+    static const double AT[DIRECTIONS][2] = {
+        {0, 0}, {1, 0}, {-1, 0}, {0, 1}, {0, -1}, {1, 1}, {-1, -1}, {0, 0},
+    };
     float score[DIRECTIONS], mean_q[DIRECTIONS];
     if (s->flat)
         memcpy(a->along, s->axes, sizeof a->along);
@@ -523,7 +531,8 @@ static int find_best(const steer *s, enum locagen_measure measure, aim *best)
     return lobes > 0 && best->score > 0;
 }
 
-/* How R_n is to be had; where it was never learnt, its level from the power across the direction of most power. */
+/* How R_n is to be had; where it was never learnt, its level from the power across the direction of most
+ * power. */
 static locagen_whitening whitening(steer *s)
 {
     locagen_whitening how = {.mics = usable_mics(s), .signal_scale = (float)(1 / s->heard)};
@@ -572,21 +581,22 @@ static locagen_source told(const aim *a, double t, int mics)
     double x[2] = {dot(a->along[0], azimuth), dot(a->along[1], azimuth)};
     double y[2] = {dot(a->along[0], elevation), dot(a->along[1], elevation)};
     const double *h = a->hessian;
+    double xx = h[0] * x[0] * x[0] + 2 * h[1] * x[0] * x[1] + h[2] * x[1] * x[1];
+    double xy = h[0] * x[0] * y[0] + h[1] * (x[0] * y[1] + x[1] * y[0]) + h[2] * x[1] * y[1];
+    double yy = h[0] * y[0] * y[0] + 2 * h[1] * y[0] * y[1] + h[2] * y[1] * y[1];
     double level = hypot(a->u[0], a->u[1]);
     return (locagen_source){
         .azimuth_rad = level > 1e-9 ? (float)atan2(a->u[1], a->u[0]) : 0.0f,
         .elevation_rad = (float)atan2(-a->u[2], level),
         .score = (float)(t * a->score),
         .snr = (float)fmax(0, (a->mean_q - 1) / __builtin_popcount((unsigned)mics)),
-        .information = {(float)(-t * (h[0] * x[0] * x[0] + 2 * h[1] * x[0] * x[1] + h[2] * x[1] * x[1])),
-                        (float)(-t * (h[0] * x[0] * y[0] + h[1] * (x[0] * y[1] + x[1] * y[0]) + h[2] * x[1] * y[1])),
-                        (float)(-t * (h[0] * y[0] * y[0] + 2 * h[1] * y[0] * y[1] + h[2] * y[1] * y[1]))},
+        .information = {(float)(-t * xx), (float)(-t * xy), (float)(-t * yy)},
     };
 }
 
-/* Whether a further source is one that others should make room for: not noise, of which the smoothed bins alone give
- * about one each; not what an inexact null leaves of the source before. Nulling a direction that holds no source would
- * cost the others up to ten degrees (measured at 10 dB). */
+/* Whether a further source is one that others should make room for: not noise, of which the smoothed bins
+ * alone give about one each; not what an inexact null leaves of the source before. Nulling a direction that
+ * holds no source would cost the others up to ten degrees (measured at 10 dB). */
 static int is_sure(const steer *s, const aim *aims, const double *score, int n)
 {
     int sure = looks(s) * score[n] > 4.0 * s->bins / (2 * s->fine.half + 1) && score[n] > 0.05 * score[0];
@@ -595,8 +605,8 @@ static int is_sure(const steer *s, const aim *aims, const double *score, int n)
     return sure;
 }
 
-/* Each direction anew with all others nulled, twice round: a source found first was found with the others in the
- * way (the relaxation of Li & Stoica 1996, "Efficient mixed-spectrum estimation"). */
+/* Each direction anew with all others nulled, twice round: a source found first was found with the others in
+ * the way (the relaxation of Li & Stoica 1996, "Efficient mixed-spectrum estimation"). */
 static void relax(steer *s, locagen_whitening how, int found, aim *aims)
 {
     how.nulls = found - 1;

@@ -14,8 +14,8 @@ enum {
     BIN_BLOCK = 16  /* planes are padded to whole cache lines */
 };
 
-/* What a search reads: numerator and denominator of q as sums over pairs. Two diagonals' sums first, then of each pair
- * re and im of the numerator, re and im of the denominator. */
+/* What a search reads: numerator and denominator of q as sums over pairs. Two diagonals' sums first, then of
+ * each pair re and im of the numerator, re and im of the denominator. */
 typedef struct {
     int32_t bins, stride, half; /* half: bins each side that q is averaged over */
     float weight;               /* bins of the band that one of these stands for */
@@ -42,7 +42,7 @@ typedef struct steer {
     int32_t frame_mics;         /* mask: microphones that the last frame may be used of */
     double learnt, heard;       /* sum of the weights in R_n, R_x: 0 at the start, then towards 1 */
     double heard_variance, heard_weights[8];
-    float lost_noise[MOST_MICS], lost_signal[MOST_MICS]; /* the part of those weights without this microphone */
+    float lost_noise[MOST_MICS], lost_signal[MOST_MICS]; /* of those weights, what lacks this microphone */
 
     float *bins_re, *bins_im;   /* [mic][stride]: the last frame */
     float *noise, *signal;      /* matrices R_n, R_x times the sum of their weights */
@@ -69,8 +69,8 @@ typedef struct locagen_steer_paths {
     int (*listen)(steer *s, const float *in, float *power);
     void (*add)(const steer *s, float keep, float share, float *matrix);
     void (*whiten)(const steer *s, const locagen_whitening *how);
-    void (*score)(const steer *s, const locagen_response *r, enum locagen_measure measure, const float *phases,
-                  int32_t groups, float *score, float *mean_q);
+    void (*score)(const steer *s, const locagen_response *r, enum locagen_measure measure,
+                  const float *phases, int32_t groups, float *score, float *mean_q);
 } locagen_steer_paths;
 
 extern const locagen_steer_paths locagen_steer_quad;

@@ -1,7 +1,7 @@
 /* steering_path.h - the score of directions; lanes are directions.
  *
- * The phases of a direction go from bin to bin by one complex product: no table but each direction's first phase
- * and step. Over 451 bins the product's rounding grows to about 1e-5, of a phase of several radians.
+ * The phases of a direction go from bin to bin by one complex product: no table but each direction's first
+ * phase and step. Over 451 bins the product's rounding grows to about 1e-5, of a phase of several radians.
  */
 #ifndef LOCAGEN_STEERING_PATH_H
 #define LOCAGEN_STEERING_PATH_H
@@ -11,7 +11,7 @@
 
 static int listen(steer *s, const float *in, float *power)
 {
-    /* 1e8: far over any converter's full scale, and far enough under float's range for the squares to come. */
+    /* 1e8: far over any full scale, and far enough under float's range for the squares to come. */
     int bad = 0;
     for (int group = 0; group < s->spectrum.groups; group++) {
         quad sum;
@@ -73,8 +73,8 @@ static void (*const RESPONSES_OF[MOST_MICS + 1])(const locagen_response *, const
 };
 
 /* log x for 1 <= x < FLT_MAX: exponent and mantissa m within sqrt(1/2) to sqrt(2), log m = 2 artanh t with
- * t = (m - 1) / (m + 1), |t| < 0.172: the first term left out is 2 t^9 / 9, under 3e-8; the whole, with float's
- * rounding, 1e-6. */
+ * t = (m - 1) / (m + 1), |t| < 0.172: the first term left out is 2 t^9 / 9, under 3e-8; the whole, with
+ * float's rounding, 1e-6. */
 INLINE vec logarithm(vec x)
 {
     ivec bits = (ivec)x - 0x3f3504f3; /* sqrt(1/2) */
