@@ -596,7 +596,7 @@ static locagen_source told(const aim *a, double t, int mics)
 
 /* Whether a further source is one that others should make room for: not noise, of which the smoothed bins
  * alone give about one each; not what an inexact null leaves of the source before. Nulling a direction that
- * holds no source would cost the others up to ten degrees (measured at 10 dB). */
+ * holds no source would cost the others many degrees (measured: up to 16). */
 static int is_sure(const steer *s, const aim *aims, const double *score, int n)
 {
     int sure = looks(s) * score[n] > 4.0 * s->bins / (2 * s->fine.half + 1) && score[n] > 0.05 * score[0];
