@@ -105,6 +105,7 @@ nightly: $(VENV)/.dev csrc-test csrc-test-aarch64 ## the tests with many more an
 bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(call need,libfftw3-dev,comparing with FFTW)
 	$(BIN)/python bench/bench_kernel.py
+	$(BIN)/python bench/bench_steered.py
 	$(BIN)/python bench/bench_pipeline.py
 	$(BIN)/python bench/bench_accuracy.py --trials 100
 
