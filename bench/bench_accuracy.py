@@ -36,7 +36,7 @@ from locagen_edge.sim.propagation import place, plane_wave
 from locagen_edge.sim.rotors import hubs_m, rotor
 from locagen_edge.types import F64, Frame
 
-ESTIMATORS = ("far-field", "hyperbolic", "two-mic", "model:tdoa-mlp")
+ESTIMATORS = ("steered", "far-field", "hyperbolic", "two-mic", "model:tdoa-mlp")
 PEERS = ("SRP", "MUSIC", "NormMUSIC", "TOPS")
 LEAD = 40  # frames of noise before the call: 2.1 s
 SETTINGS = from_table({"array": {"tolerance_m": 0.0}})

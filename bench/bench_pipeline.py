@@ -23,7 +23,7 @@ from locagen_edge.settings import from_table
 from locagen_edge.sim.scene import frames
 from locagen_edge.types import Frame
 
-ESTIMATORS = ("far-field", "two-mic", "model:tdoa-mlp", "hyperbolic")
+ESTIMATORS = ("steered", "far-field", "two-mic", "model:tdoa-mlp", "hyperbolic")
 
 
 def measure(rounds: int) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from locagen_edge.errors import SourceError
 from locagen_edge.geometry import tolerance_rad
 from locagen_edge.settings import Settings
-from locagen_edge.stages.bearing import make_estimator
+from locagen_edge.stages.bearing import make_locator
 from locagen_edge.stages.correlation import Correlator
 from locagen_edge.stages.detection import Detector
 from locagen_edge.stages.faults import FaultFinder
@@ -30,7 +30,7 @@ class Pipeline:
         self._hop_s = settings.hop_s
         self._correlate = Correlator(*shape)
         self._pick = PeakPicker(*shape)
-        self._locate = make_estimator(settings)
+        self._locate = make_locator(settings)
         self._detect = Detector(settings.detection)
         self._find_faults = FaultFinder()
         self._track = Tracker(
@@ -46,8 +46,9 @@ class Pipeline:
         self._last_ns = frame.t_ns
         correlation = self._correlate(frame)
         tdoa = self._pick(correlation)
-        bearing = self._locate(tdoa)
-        detection = self._detect(correlation, bearing.misfit, elapsed_s)
+        bearing = self._locate(frame, tdoa)
+        detection = self._detect(correlation, bearing, elapsed_s)
+        self._locate.settle(detection.call)
         return Estimate(
             t_ns=frame.t_ns,
             start=frame.start,

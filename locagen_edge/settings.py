@@ -208,8 +208,44 @@ class BearingSettings:
     estimator: str = setting(
         "far-field",
         "`far-field`: least squares over all pairs. `hyperbolic`: the paper's solver, with a position. "
-        "`two-mic`: arcsin of the first pair alone. `model:NAME`: a learned one from the models directory.",
-        pattern=rf"far-field|hyperbolic|two-mic|model:{NAME}",
+        "`two-mic`: arcsin of the first pair alone. `model:NAME`: a learned one from the models directory. "
+        "`steered`: greatest likelihood over directions, with the noise's own matrix divided out.",
+        pattern=rf"far-field|hyperbolic|two-mic|steered|model:{NAME}",
+    )
+
+
+@dataclass(frozen=True)
+class SteeredSettings:
+    """The estimator `steered`."""
+
+    taper: float = setting(
+        0.1,
+        "Share of the window that is tapered. 0.1 wastes least of the sound; 1 (Hann) keeps strong rotor "
+        "tones from spreading over their neighbours.",
+        least=0,
+        most=1,
+    )
+    smooth_bins: int = setting(
+        6,
+        "Bins to each side over which a caller's spectrum is taken for smooth.",
+        unit="bins",
+        least=0,
+        most=64,
+    )
+    score: float = setting(
+        60.0,
+        "Least log-likelihood ratio of a source against noise alone; below it there is no bearing. Noise "
+        "alone gives 10 to 40, a loud caller hundreds.",
+        least=0,
+        most=1e6,
+    )
+    forget_s: float = setting(
+        4.0,
+        "How fast the noise's matrix is learnt and forgotten, while nothing calls: shorter follows the "
+        "throttle, longer is more exact.",
+        unit="s",
+        least=0.2,
+        most=600,
     )
 
 
@@ -313,6 +349,7 @@ class Settings:
     sim: SimSettings = SimSettings()
     correlation: CorrelationSettings = CorrelationSettings()
     bearing: BearingSettings = BearingSettings()
+    steered: SteeredSettings = SteeredSettings()
     detection: DetectionSettings = DetectionSettings()
     track: TrackSettings = TrackSettings()
     models: ModelsSettings = ModelsSettings()

@@ -96,7 +96,8 @@ class Bearing:
     """positive up; None where the array cannot tell"""
     elevation_sigma_rad: float
     misfit: float
-    """rms of (measured - fitted) delay over its sigma; about 1 when one far source explains all pairs"""
+    """rms of (measured - fitted) delay over its sigma; about 1 when one far source explains all pairs; 0
+    where an estimator judges that otherwise"""
     estimator: str
     fix: Fix | None = None
 

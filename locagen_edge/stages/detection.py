@@ -1,4 +1,4 @@
-"""Frame's level and misfit -> Detection: does something call?
+"""Frame's level and its bearing's misfit -> Detection: does something call?
 
 The in-band level is held against the background: the lowest smoothed level of the last
 `detection.background_s` (minimum statistics: Martin, "Noise power spectral density estimation based on
@@ -16,7 +16,7 @@ from collections import deque
 import numpy as np
 
 from locagen_edge.settings import DetectionSettings
-from locagen_edge.types import Correlation, Detection
+from locagen_edge.types import Bearing, Correlation, Detection
 
 SILENCE = 1e-12
 """-120 dBFS: under any converter's noise. Quieter frames are no background, but a muted input."""
@@ -42,7 +42,7 @@ class Detector:
         self._minima: deque[float] = deque(maxlen=PIECES)
         self._piece_s = 0.0
 
-    def __call__(self, correlation: Correlation, misfit: float, elapsed_s: float) -> Detection:
+    def __call__(self, correlation: Correlation, bearing: Bearing, elapsed_s: float) -> Detection:
         """`elapsed_s`: since the previous frame."""
         power = correlation.power.astype(np.float64)
         live = power[power > SILENCE]
@@ -53,7 +53,7 @@ class Detector:
         least, most = SNR_RANGE_DB
         excess = level / background - 1.0
         snr_db = min(max(10.0 * math.log10(excess), least), most) if excess > 0.0 else least
-        call = snr_db >= self._settings.snr_db and misfit <= self._settings.misfit
+        call = snr_db >= self._settings.snr_db and bearing.misfit <= self._settings.misfit
         return Detection(call=call, snr_db=snr_db, level_dbfs=10.0 * math.log10(level))
 
     def _follow(self, level: float, elapsed_s: float) -> float:

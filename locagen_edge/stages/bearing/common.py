@@ -5,14 +5,39 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from locagen_edge.geometry import MicArray
 from locagen_edge.settings import Settings
-from locagen_edge.types import F64, Bearing, Tdoa
+from locagen_edge.types import F64, Bearing, Frame, Tdoa
 
 Estimator = Callable[[Tdoa], Bearing]
+"""From delays to a direction, frame by frame."""
+
+
+class Locator(Protocol):
+    """What the pipeline asks for a bearing, once a frame."""
+
+    def __call__(self, frame: Frame, tdoa: Tdoa, /) -> Bearing: ...
+
+    def settle(self, call: bool, /) -> None:
+        """Told afterwards whether the frame was taken for a call."""
+
+
+class OnDelays:
+    """A locator that needs the delays only, and remembers nothing."""
+
+    def __init__(self, estimate: Estimator):
+        self._estimate = estimate
+
+    def __call__(self, _: Frame, tdoa: Tdoa, /) -> Bearing:
+        return self._estimate(tdoa)
+
+    def settle(self, _: bool, /) -> None:
+        """Nothing is learnt."""
+
 
 NOWHERE_RAD = math.pi / math.sqrt(3.0)
 """1-sigma of an angle that may be anything: the standard deviation of a uniform one, 104 degrees."""
