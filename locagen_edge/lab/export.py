@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import warnings
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import numpy as np
 import onnx
 import torch
 
+from locagen_edge.lab.files import write
 from locagen_edge.models import MANIFEST
 
 OPSET = 18
@@ -63,9 +63,9 @@ def install(name: str, content: bytes, positions_m: np.ndarray, card: str, direc
         "array_m": np.round(positions_m, 6).tolist(),
         "card": f"{name}.md",
     }
-    _write(directory / f"{name}.onnx", content)
-    _write(directory / f"{name}.md", card.encode())
-    _write(path, (json.dumps(manifest, indent=2) + "\n").encode())
+    write(directory / f"{name}.onnx", content)
+    write(directory / f"{name}.md", card)
+    write(path, json.dumps(manifest, indent=2) + "\n")
 
 
 def _tensor(value: Any) -> dict[str, Any]:
@@ -75,9 +75,3 @@ def _tensor(value: Any) -> dict[str, Any]:
         "type": TYPES[tensor.elem_type],
         "shape": [d.dim_value for d in tensor.shape.dim],
     }
-
-
-def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)

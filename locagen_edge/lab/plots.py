@@ -14,6 +14,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
+from locagen_edge.lab.files import replacing
+
 STYLES: dict[str, dict[str, Any]] = {
     "best possible": {"color": "black", "linestyle": "-", "linewidth": 4.0, "alpha": 0.3},
     "least squares": {"color": "tab:blue", "marker": "o"},
@@ -38,6 +40,7 @@ LABELS = {
     "forest-24-median": "forest, 24 bins, median",
     "forest": "forest, regression",
     "mlp": "MLP",
+    "mlp-pairs": "MLP on all pairs, no ratio",
     "siren": "SIREN",
     "siren-unscaled": "SIREN, inputs unscaled",
 }
@@ -55,13 +58,20 @@ PAPER: dict[str, Any] = {
 
 
 def draw_all(result: dict[str, Any], folder: Path) -> None:
-    """Writes every figure as NAME.png."""
+    """Writes the figure of every experiment in the result as NAME.png."""
+    for name, (experiment, function, size) in FIGURES.items():
+        if experiment in result:
+            draw(folder / f"{name}.png", lambda axes, function=function: function(axes, result), size)
+
+
+def draw(path: Path, function: Callable[[Axes], None], size: tuple[float, float]) -> None:
+    """Writes one figure of this size in inches."""
     with matplotlib.rc_context({"figure.dpi": 120, "font.size": 9, "axes.grid": True, "grid.alpha": 0.3}):
-        for name, (function, size) in FIGURES.items():
-            figure, axes = plt.subplots(figsize=size, layout="constrained")
-            function(axes, result)
-            figure.savefig(folder / f"{name}.png", metadata={"Software": None})
-            plt.close(figure)
+        figure, axes = plt.subplots(figsize=size, layout="constrained")
+        function(axes)
+        with replacing(path) as temporary:
+            figure.savefig(temporary, format="png", metadata={"Software": None})
+        plt.close(figure)
 
 
 def label(name: str) -> str:
@@ -76,7 +86,7 @@ def _plain(axis: Any) -> None:
 def histogram(axes: Axes, result: dict[str, Any]) -> None:
     data = result["distribution"]
     edges = np.array(data["edges_deg"])
-    rows = result["by_rate"].get(str(result["setup"]["rate_hz"]), {})
+    rows = result.get("by_rate", {}).get(str(result["setup"]["rate_hz"]), {})
     for name, share in data["histogram"].items():
         style = STYLES[name]
         mae = f", mean {rows[name]['mae_deg']:.1f}°" if name in rows else ""
@@ -215,14 +225,44 @@ def learning(axes: Axes, result: dict[str, Any]) -> None:
     axes.legend()
 
 
-FIGURES: dict[str, tuple[Callable[[Axes, dict[str, Any]], None], tuple[float, float]]] = {
-    "histogram": (histogram, (7, 4.2)),
-    "cdf-48khz": (cdf, (7, 4.5)),
-    "mae-by-rate": (rates, (8.5, 5)),
-    "mae-by-spacing": (spacings, (8.5, 4.5)),
-    "offsets-position": (offsets_position, (5.5, 4.5)),
-    "offsets-azimuth": (offsets_azimuth, (5.5, 4.5)),
-    "time": (times, (7, 3.8)),
-    "learning": (learning, (7, 4.2)),
+def from_waveforms(axes: Axes, result: dict[str, Any]) -> None:
+    data = result["waveforms"]["mae_deg"]
+    names = list(next(iter(data.values())))[::-1]
+    height = 0.8 / len(data)
+    for k, (scene, row) in enumerate(data.items()):
+        at = np.arange(len(names)) + 0.4 - height * (k + 0.5)
+        values = [row[name] for name in names]
+        axes.barh(at, values, height, label=scene, color=("tab:purple", "tab:cyan")[k % 2])
+        for y, value in zip(at, values, strict=True):
+            axes.annotate(f"{value:.2f}°", (value, y), xytext=(3, 0), textcoords="offset points", va="center")
+    told = result["waveforms"]["paper_deg"]
+    axes.plot(
+        list(told.values()), [names.index(name) for name in told], label="the paper's own figures", **PAPER
+    )
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(visible=False, axis="y")
+    axes.set(
+        xlabel="mean |azimuth error| (degrees)",
+        xscale="log",
+        xlim=(0.08, 60),
+        title=f"From sound, {result['setup']['rate_hz'] / 1000:g} kHz, "
+        f"{100 * result['setup']['spacing_m']:g} cm, one frame",
+    )
+    _plain(axes.xaxis)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.12), ncol=3)
+
+
+Drawing = Callable[[Axes, dict[str, Any]], None]
+
+FIGURES: dict[str, tuple[str, Drawing, tuple[float, float]]] = {
+    "histogram": ("distribution", histogram, (7, 4.2)),
+    "cdf-48khz": ("distribution", cdf, (7, 4.5)),
+    "mae-by-rate": ("by_rate", rates, (8.5, 5)),
+    "from-waveforms": ("waveforms", from_waveforms, (8.5, 4.8)),
+    "mae-by-spacing": ("by_spacing", spacings, (8.5, 4.5)),
+    "offsets-position": ("offsets", offsets_position, (5.5, 4.5)),
+    "offsets-azimuth": ("offsets", offsets_azimuth, (5.5, 4.5)),
+    "time": ("times", times, (7, 3.8)),
+    "learning": ("learning", learning, (7, 4.2)),
 }
-"""Name, drawing, size in inches."""
+"""Name: the experiment it shows, drawing, size in inches."""
