@@ -16,7 +16,6 @@ from locagen_edge.geometry import direction
 from locagen_edge.lab.bound import best_table, look_up, mae_deg
 from locagen_edge.lab.features import Features, normalised
 from locagen_edge.lab.forest import Forest
-from locagen_edge.lab.install import install_method
 from locagen_edge.lab.methods import METHODS, split, take, train
 from locagen_edge.lab.nets.siren import siren
 from locagen_edge.lab.settings import LabSettings

@@ -121,7 +121,7 @@ def cramer_rao_deg(
 def expected_deg(
     array: MicArray, speed_m_s: float, azimuth_rad: F64, elevation_rad: F64, sigma_s: float | F64
 ) -> F64:
-    """The smallest mean |azimuth error| (n,) in degrees of far sources whose arrivals are off by sigma_s (n,).
+    """The smallest mean |azimuth error| (n,) in degrees of far sources whose arrivals are off by sigma_s.
 
     J = sum_m (tau'_m - mean)^2 / sigma^2, with tau'_m the change of an arrival with the azimuth, which
     shrinks with the elevation's cosine; a Gaussian error of variance 1 / J has the mean sqrt(2 / (pi J)).

@@ -15,10 +15,12 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 import torch
 
 from locagen_edge.lab.files import write
 from locagen_edge.models import MANIFEST
+from locagen_edge.types import F32
 
 OPSET = 18
 TYPES = {onnx.TensorProto.FLOAT: "tensor(float)"}
@@ -66,6 +68,14 @@ def install(name: str, content: bytes, positions_m: np.ndarray, card: str, direc
     write(directory / f"{name}.onnx", content)
     write(directory / f"{name}.md", card)
     write(path, json.dumps(manifest, indent=2) + "\n")
+
+
+def answers_of(content: bytes, x: F32) -> F32:
+    """What the file answers (n, outputs) to inputs (n, ...), one by one as in flight."""
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    (given,) = session.get_inputs()
+    answers: F32 = np.concatenate([session.run(None, {given.name: row[None]})[0] for row in x])
+    return answers
 
 
 def _tensor(value: Any) -> dict[str, Any]:

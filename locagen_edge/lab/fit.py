@@ -13,7 +13,6 @@ import torch
 from locagen_edge.lab.settings import MlpSettings, SirenSettings
 from locagen_edge.types import F32, F64
 
-
 Tell = Callable[[int, int, float], None]
 """told after each pass: its number from 1, how many there are at most, mean |error| on validation samples"""
 

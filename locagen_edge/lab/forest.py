@@ -143,7 +143,7 @@ class Forest:
         return content
 
     def _trees(self, inputs: int) -> onnx.ModelProto:
-        """scikit-learn's forest alone: features (1, inputs) to probabilities (1, bins) or directions (1, 2)."""
+        """The forest alone: features (1, inputs) to probabilities (1, bins) or directions (1, 2)."""
         model: onnx.ModelProto = convert_sklearn(
             self._model,
             name="forest",  # else one drawn at random: same trees, same bytes

@@ -33,6 +33,8 @@ class Trained:
     onnx: Callable[[], bytes]
     """the model file: normalised delays of all pairs (1, pairs) to cosine and sine (1, 2)"""
     history: History | None = None
+    ties: bool = False
+    """whether two angles may be equally good answers, which the last bit tells apart"""
 
 
 Maker = Callable[[LabSettings, Arrivals, Tell], Trained]
@@ -48,7 +50,9 @@ def _forest(bins: int, reading: str) -> Maker:
         def azimuths(delay_s: F32) -> F64:
             return forest.predict(apply(features, normalised(delay_s, array, s.speed_m_s)))
 
-        return Trained(azimuths, lambda: forest.to_onnx(features, len(array.pairs)))
+        return Trained(
+            azimuths, lambda: forest.to_onnx(features, len(array.pairs)), ties=reading in ("median", "centre")
+        )
 
     return make
 
@@ -125,9 +129,9 @@ METHODS: dict[str, Maker] = {
         siren, "siren", _in_seconds, omega=1.0, omega_hidden=1.0, rate=1e-4, epochs=20
     ),
 }
-"""The paper's; beside its classifiers the forest that regresses cosine and sine, and beside its MLP the one on
-the delays of all pairs as they are. The ratio goes through infinity at two azimuths, which whole-sample delays
-never meet and sub-sample ones do."""
+"""The paper's; beside its classifiers the forest that regresses cosine and sine, and beside its MLP the one
+on the delays of all pairs as they are: the ratio goes through infinity at two azimuths, which whole-sample
+delays never meet and sub-sample ones do."""
 
 
 def train(name: str, s: LabSettings, data: Arrivals, tell: Tell = quiet) -> Trained:

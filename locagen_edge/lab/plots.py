@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,7 @@ def draw_all(result: dict[str, Any], folder: Path) -> None:
     """Writes the figure of every experiment in the result as NAME.png."""
     for name, (experiment, function, size) in FIGURES.items():
         if experiment in result:
-            draw(folder / f"{name}.png", lambda axes, function=function: function(axes, result), size)
+            draw(folder / f"{name}.png", partial(function, result=result), size)
 
 
 def draw(path: Path, function: Callable[[Axes], None], size: tuple[float, float]) -> None:
@@ -250,6 +251,25 @@ def from_waveforms(axes: Axes, result: dict[str, Any]) -> None:
     )
     _plain(axes.xaxis)
     axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.12), ncol=3)
+
+
+def training(axes: Axes, result: dict[str, Any]) -> None:
+    """Of a report of `train`: error over SNR, beside least squares and the best possible."""
+    snr = [float(key) for key in result["by_snr"]]
+    styles = {"model": "mlp", "least squares": "least squares", "best possible": "best possible"}
+    for name, style in styles.items():
+        shown = f"model {result['name']}" if name == "model" else name
+        values = [row[name] for row in result["by_snr"].values()]
+        axes.plot(snr, values, label=shown, **STYLES[style])
+    axes.set(
+        xlabel="in-band SNR (dB)",
+        ylabel="mean |azimuth error| (degrees)",
+        yscale="log",
+        title=f"{result['name']}: one frame, {result['level']}",
+    )
+    _plain(axes.yaxis)
+    axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
+    axes.legend()
 
 
 Drawing = Callable[[Axes, dict[str, Any]], None]
