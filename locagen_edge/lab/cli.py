@@ -91,6 +91,20 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--samples", type=int, help="how many to make (default: data.samples)")
     train.add_argument("--workers", type=int, default=1, help="processes that make data (default 1)")
     train.set_defaults(command=_train)
+    evaluate = commands.add_parser(
+        "evaluate",
+        parents=[common],
+        help="hold field recordings against the twin",
+        description="Run labelled recordings through the pipeline that flies, and tell angle and distance "
+        "differences beside what the twin predicts. Writes report.md, report.json and error.png. The folder "
+        "holds recordings and labels.csv or labels.jsonl with the columns file, time_s, azimuth_deg (or lat, "
+        "lon, array_lat, array_lon, heading_deg), and if known range_m, snr_db.",
+    )
+    evaluate.add_argument("--recordings", type=Path, required=True, metavar="FOLDER",
+                          help="WAV or FLAC files, and their labels")  # fmt: skip
+    evaluate.add_argument("--out", type=Path, default=Path("field-report"), metavar="DIR",
+                          help="where to write (default: field-report)")  # fmt: skip
+    evaluate.set_defaults(command=_evaluate)
     dataset_cli.add_command(commands)
     return parser
 
@@ -161,6 +175,23 @@ def _train(arguments: argparse.Namespace) -> int:
     write(arguments.out / "report.md", train.markdown(result))
     print(train.line(result))
     print(f"wrote {arguments.out / 'report.md'}; fly it with --settings {arguments.out / 'flight.toml'}")
+    return 0
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    settings = read(arguments.settings)
+
+    from locagen_edge.lab import evaluate
+    from locagen_edge.lab.plots import draw, field
+
+    result = evaluate.evaluate(arguments.recordings, settings)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    if "bias_deg" in result["statistics"]:
+        draw(arguments.out / "error.png", lambda axes: field(axes, result), (8, 4.2))
+    write(arguments.out / "report.json", json.dumps(result, indent=1) + "\n")
+    write(arguments.out / "report.md", evaluate.markdown(result))
+    print(evaluate.line(result))
+    print(f"wrote {arguments.out / 'report.md'}")
     return 0
 
 

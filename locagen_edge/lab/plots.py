@@ -245,7 +245,7 @@ def from_waveforms(axes: Axes, result: dict[str, Any]) -> None:
     axes.set(
         xlabel="mean |azimuth error| (degrees)",
         xscale="log",
-        xlim=(0.08, 60),
+        xlim=(0.08, 200),
         title=f"From sound, {result['setup']['rate_hz'] / 1000:g} kHz, "
         f"{100 * result['setup']['spacing_m']:g} cm, one frame",
     )
@@ -269,6 +269,28 @@ def training(axes: Axes, result: dict[str, Any]) -> None:
     )
     _plain(axes.yaxis)
     axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
+    axes.legend()
+
+
+def field(axes: Axes, result: dict[str, Any]) -> None:
+    """Of a report of `evaluate`: every label's error over azimuth, and how far the twin's reach."""
+    rows = [row for row in result["labels"] if row["error_deg"] is not None]
+    azimuth = np.array([row["azimuth_deg"] for row in rows])
+    error = np.array([row["error_deg"] for row in rows])
+    twin = np.array([row["twin_95_deg"] for row in rows])
+    order = azimuth.argsort()
+    axes.vlines(azimuth[order], -twin[order], twin[order], color="tab:cyan", alpha=0.5, linewidth=4.0,
+                label="95 % of the twin's errors at the same SNR and azimuth")  # fmt: skip
+    axes.plot(azimuth, error, "o", color="tab:red", markersize=4, label="field")
+    bias = result["statistics"]["bias_deg"]
+    axes.axhline(bias, color="tab:red", linestyle="--", linewidth=1, label=f"common turn, {bias:+.2f}°")
+    axes.set(
+        xlabel="true azimuth (degrees)",
+        ylabel="estimate less truth (degrees)",
+        xlim=(0, 360),
+        title=f"{len(rows)} labels, estimator {result['estimator']}",
+    )
+    axes.set_xticks(range(0, 361, 45))
     axes.legend()
 
 
