@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 
 from locagen_edge.errors import ModelError
 from locagen_edge.geometry import direction
 from locagen_edge.lab.bound import best_table, look_up, mae_deg
+from locagen_edge.lab.export import answers_of, install
 from locagen_edge.lab.features import Features, normalised
 from locagen_edge.lab.forest import Forest
 from locagen_edge.lab.methods import METHODS, split, take, train
@@ -136,9 +135,8 @@ def test_exported_models_say_what_the_trained_ones_say(name, rounding) -> None:
     s = with_twin(SMALL, rounding=rounding)
     learned, test = sample(s, 2_000, 1), sample(s, 100, 2)
     trained = train(name, s, learned)
-    session = onnxruntime.InferenceSession(trained.onnx(), providers=["CPUExecutionProvider"])
     x = normalised(test.delay_s, s.mic_array, s.speed_m_s)
-    answers = np.concatenate([session.run(None, {"delays": row[None]})[0] for row in x])
+    answers = answers_of(trained.onnx(), x)
     assert answers.shape == (100, 2)
     found = np.arctan2(answers[:, 1], answers[:, 0].astype(np.float64))
     off = np.abs(np.angle(np.exp(1j * (found - trained.azimuths(test.delay_s)))))
@@ -148,12 +146,9 @@ def test_exported_models_say_what_the_trained_ones_say(name, rounding) -> None:
 
 
 def test_installed_model_flies_by_its_name(tmp_path) -> None:
-    for name in ("mlp", "forest"):
-        line = install_method(name, LabSettings() if name == "forest" else SMALL, tmp_path)
-        assert name in line
-    manifest = json.loads((tmp_path / "manifest.json").read_text())["models"]
-    assert set(manifest) == {"mlp", "forest"}
-    assert "c (t_j - t_i) / d_ij" in (tmp_path / "forest.md").read_text()
+    s = LabSettings()
+    learned, _ = split(sample(s, s.data.samples, 1), s.data.train_share)
+    install("forest", train("forest", s, learned).onnx(), s.mic_array.positions_m, "# forest\n", tmp_path)
     s = dataclasses.replace(
         LabSettings(),
         models=dataclasses.replace(LabSettings().models, directory=str(tmp_path)),
@@ -169,9 +164,9 @@ def test_installed_model_flies_by_its_name(tmp_path) -> None:
     assert math.degrees(np.mean(off)) < 8.0  # 6.7 and three standard errors of 200 samples
 
 
-def test_an_unknown_method_is_refused_with_the_names_of_all(tmp_path) -> None:
+def test_an_unknown_method_is_refused_with_the_names_of_all() -> None:
     with pytest.raises(ModelError, match="forest-24-mean"):
-        install_method("oracle", SMALL, tmp_path)
+        train("oracle", SMALL, sample(SMALL, 100, 1))
 
 
 # --- methods that learn nothing -----------------------------------------------------------------------

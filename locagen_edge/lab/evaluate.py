@@ -32,9 +32,9 @@ from locagen_edge.types import F64, Estimate, Tdoa
 STEP_DB = 5.0
 """The twin is asked at these SNRs, as far as the field has them."""
 SNR_RANGE_DB = (-10.0, 40.0)
-SWEEP_STEP_DEG = 0.5
-NEAR_DEG = 15.0
-"""A label is held against the twin's samples within this of its azimuth: 60 of them."""
+SWEEP_STEP_DEG = 1.0
+NEAR_DEG = 20.0
+"""A label is held against the twin's samples within this of its azimuth: 41 of them."""
 
 
 def evaluate(folder: Path, s: LabSettings) -> dict[str, Any]:
@@ -63,7 +63,8 @@ def evaluate(folder: Path, s: LabSettings) -> dict[str, Any]:
 def _check_times(folder: Path, s: LabSettings, labels: Iterable[Label]) -> None:
     lengths = {file: wav_duration_s(folder / file, s) for file in {label.file for label in labels}}
     faults = [
-        f"{label.place}: time_s: {label.time_s:g} is after the end of {label.file} ({lengths[label.file]:.2f} s)"
+        f"{label.place}: time_s: {label.time_s:g} is after the end of {label.file}, "
+        f"{lengths[label.file]:.2f} s long"
         for label in labels
         if label.time_s > lengths[label.file]
     ]
@@ -116,25 +117,32 @@ def _row(label: Label, estimate: Estimate, fix: Any) -> dict[str, Any]:
 
 
 def _predict(s: LabSettings, rows: list[dict[str, Any]]) -> None:
-    """Adds to every row what the twin does at its SNR and azimuth: mean |error|, its 95th percentile."""
+    """Adds to every row what the twin does at its SNR and azimuth: mean |error|, its 95th percentile.
+
+    Where labels have ranges, the same of distance, at the median of all ranges.
+    """
     least, most = SNR_RANGE_DB
     at = [round(min(max(row["snr_db"], least), most) / STEP_DB) * STEP_DB for row in rows]
     ranges = [row["range_m"] for row in rows if row["range_m"] is not None]
     range_m = float(np.median(ranges)) if ranges else s.twin.range_m
     swept = {
-        snr_db: _swept(s, snr_db, range_m)
+        snr_db: _swept(s, snr_db, range_m, with_range=bool(ranges))
         for snr_db in tqdm(sorted(set(at)), desc="twin", unit=" SNRs", disable=None)
     }
     for row, snr_db in zip(rows, at, strict=True):
-        azimuth_deg, off_deg = swept[snr_db]
+        azimuth_deg, off_deg, off_m = swept[snr_db]
         near = np.abs((azimuth_deg - row["azimuth_deg"] + 180.0) % 360.0 - 180.0) <= NEAR_DEG
         row["twin_snr_db"] = snr_db
         row["twin_deg"] = float(off_deg[near].mean())
         row["twin_95_deg"] = float(np.percentile(off_deg[near], 95))
+        known = off_m[near][np.isfinite(off_m[near])]
+        row["twin_range_share"] = len(known) / int(near.sum())
+        row["twin_m"] = float(known.mean()) if len(known) else None
 
 
-def _swept(s: LabSettings, snr_db: float, range_m: float) -> tuple[F64, F64]:
-    """Azimuths (n,) all round and |errors| (n,) of the estimator on the twin's frames, degrees."""
+def _swept(s: LabSettings, snr_db: float, range_m: float, with_range: bool) -> tuple[F64, F64, F64]:
+    """Azimuths (n,) all round, the estimator's |errors| (n,) on the twin's frames, both in degrees, and
+    those of the hyperbolic solver's range (n,) in metres, NaN where it cannot be known."""
     keys = {"noise": "snr", "snr_db": snr_db, "source": "sweep", "step_deg": SWEEP_STEP_DEG}
     here = dataclasses.replace(
         s,
@@ -143,15 +151,18 @@ def _swept(s: LabSettings, snr_db: float, range_m: float) -> tuple[F64, F64]:
         dataset=dataclasses.replace(s.dataset, level="waveforms", keep=()),
     )
     drawn = columns(here, round(360.0 / SWEEP_STEP_DEG), s.data.seed)
-    estimate = make_estimator(s)
-    off = []
+    estimate, locate = make_estimator(s), hyperbolic(s)
+    off, off_m = [], []
     for delay, sigma, peak, true in zip(
         drawn["delay_s"], drawn["sigma_s"], drawn["peak"], drawn["azimuth_rad"], strict=True
     ):
         tdoa = Tdoa(delay.astype(np.float64), sigma.astype(np.float64), peak.astype(np.float64))
         found = estimate(tdoa).azimuth_rad
         off.append(90.0 if found is None else abs(math.degrees(wrap(found - float(true)))))
-    return np.degrees(drawn["azimuth_rad"].astype(np.float64)) % 360.0, np.array(off)
+        fix = locate(tdoa).fix if with_range else None
+        known = fix is not None and fix.range_observable
+        off_m.append(abs(fix.range_m - range_m) if fix is not None and known else math.nan)
+    return np.degrees(drawn["azimuth_rad"].astype(np.float64)) % 360.0, np.array(off), np.array(off_m)
 
 
 # --- statistics ---------------------------------------------------------------------------------------
@@ -161,15 +172,20 @@ def statistics(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Of the field, and of the twin for the same labels; None where there is nothing to tell."""
     error = np.array([row["error_deg"] for row in rows if row["error_deg"] is not None])
     twin = np.array([row["twin_deg"] for row in rows])
+    reach = np.array([row["twin_95_deg"] for row in rows if row["error_deg"] is not None])
     metres = np.array([row["error_m"] for row in rows if row["error_m"] is not None])
+    ranged = [row for row in rows if row["range_m"] is not None]
+    twin_m = [row["twin_m"] for row in ranged if row["twin_m"] is not None]
     told: dict[str, Any] = {
         "labels": len(rows),
         "without_bearing": len(rows) - len(error),
         "twin_mean_deg": float(twin.mean()),
         "within_twin_95": None,
-        "range_labels": sum(row["range_m"] is not None for row in rows),
+        "range_labels": len(ranged),
         "range_compared": len(metres),
         "range_mean_m": float(np.abs(metres).mean()) if len(metres) else None,
+        "twin_range_mean_m": float(np.mean(twin_m)) if twin_m else None,
+        "twin_range_share": float(np.mean([row["twin_range_share"] for row in ranged])) if ranged else None,
     }
     if len(error):
         bias = math.degrees(math.atan2(np.sin(np.radians(error)).mean(), np.cos(np.radians(error)).mean()))
@@ -180,12 +196,8 @@ def statistics(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "p90_deg": float(np.percentile(np.abs(error), 90)),
             "bias_deg": bias,
             "mean_without_bias_deg": float(left.mean()),
-            "within_twin_95": float(
-                np.mean([
-                    abs(row["error_deg"]) <= row["twin_95_deg"] for row in rows if row["error_deg"] is not None
-                ])
-            ),
-        }  # fmt: skip
+            "within_twin_95": float(np.mean(np.abs(error) <= reach)),
+        }
     return told
 
 
@@ -211,33 +223,45 @@ def markdown(result: dict[str, Any]) -> str:
             f"| share within the twin's 95 % | {told['within_twin_95']:.0%} | 95% |",
             "",
             "A common turn is one of the array on its frame, or of the heading in the labels: turn "
-            "array.positions_m, or mend the labels. What is left beyond the twin's error is what the twin does "
-            "not have: echoes, wind, rotors, a position or clock that is off (set them in [scene] and [twin]).",
+            "array.positions_m, or mend the labels. What is left beyond the twin's error is what the twin "
+            "does not have: echoes, wind, rotors, a position or clock that is off (set them in [scene] and "
+            "[twin]).",
             "",
             "![error over azimuth](error.png)",
             "",
         ]
-    distance = (
-        f"mean |difference| {told['range_mean_m']:.2f} m over {told['range_compared']} labels"
-        if told["range_compared"]
-        else f"none of {told['range_labels']} labels with a range: the array cannot know it beyond 1 to 3 m"
-    )
     rows = [
-        f"| {row['label'].rpartition('/')[2]} | {row['file']} | {row['time_s']:.2f} | {row['azimuth_deg']:.1f} | "
-        f"{_number(row['estimate_deg'], '.1f')} | {_number(row['error_deg'], '+.2f')} | "
-        f"{row['twin_deg']:.2f} | {row['snr_db']:.0f} | {_number(row['range_m'], '.1f')} | "
+        f"| {row['label'].rpartition('/')[2]} | {row['file']} | {row['time_s']:.2f} | "
+        f"{row['azimuth_deg']:.1f} | {_number(row['estimate_deg'], '.1f')} | "
+        f"{_number(row['error_deg'], '+.2f')} | {row['twin_deg']:.2f} | {row['snr_db']:.0f} | {_number(row['range_m'], '.1f')} | "
         f"{_number(row['estimate_m'], '.1f')} | {_number(row['error_m'], '+.2f')} |"
         for row in result["labels"]
     ]
     lines += [
-        f"Distance by the hyperbolic solver: {distance}.",
+        *_distance(told),
         "",
-        "| label | file | time, s | azimuth | estimate | error | twin's mean | SNR, dB | range, m | estimate | error |",
+        "| label | file | time, s | azimuth | estimate | error | twin's mean | SNR, dB | range, m | "
+        "estimate | error |",
         "|" + " --- |" * 11,
         *rows,
         "",
     ]
     return "\n".join(lines)
+
+
+def _distance(told: dict[str, Any]) -> list[str]:
+    if not told["range_labels"]:
+        return ["No label has a range, so distance is not compared."]
+    return [
+        "| distance, hyperbolic solver | field | twin, same SNR and azimuth |",
+        "| --- | --- | --- |",
+        f"| mean \\|difference\\| where it can be known, m | {_number(told['range_mean_m'], '.2f')} | "
+        f"{_number(told['twin_range_mean_m'], '.2f')} |",
+        f"| share of labels where it can be known | {told['range_compared'] / told['range_labels']:.0%} | "
+        f"{told['twin_range_share']:.0%} |",
+        "",
+        "A small array cannot know the range beyond some tens of its own size, and says so.",
+    ]
 
 
 def _number(value: float | None, form: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from locagen_edge.lab.files import replacing
+
+Drawing = Callable[[Axes, dict[str, Any]], None]
 
 STYLES: dict[str, dict[str, Any]] = {
     "best possible": {"color": "black", "linestyle": "-", "linewidth": 4.0, "alpha": 0.3},
@@ -62,7 +63,11 @@ def draw_all(result: dict[str, Any], folder: Path) -> None:
     """Writes the figure of every experiment in the result as NAME.png."""
     for name, (experiment, function, size) in FIGURES.items():
         if experiment in result:
-            draw(folder / f"{name}.png", partial(function, result=result), size)
+            draw(folder / f"{name}.png", _of(function, result), size)
+
+
+def _of(function: Drawing, result: dict[str, Any]) -> Callable[[Axes], None]:
+    return lambda axes: function(axes, result)
 
 
 def draw(path: Path, function: Callable[[Axes], None], size: tuple[float, float]) -> None:
@@ -293,8 +298,6 @@ def field(axes: Axes, result: dict[str, Any]) -> None:
     axes.set_xticks(range(0, 361, 45))
     axes.legend()
 
-
-Drawing = Callable[[Axes, dict[str, Any]], None]
 
 FIGURES: dict[str, tuple[str, Drawing, tuple[float, float]]] = {
     "histogram": ("distribution", histogram, (7, 4.2)),

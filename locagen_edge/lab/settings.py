@@ -235,8 +235,8 @@ OWN: dict[str, dict[str, Any]] = {
     "dataset": {"level": "waveforms"},
     "mlp": {"patience": 40},
 }
-"""The same for a model that is to fly: sound of 0 to 30 dB from a disc below, more of it, and passes enough for
-the learning rate to come down again, which is where the last tenths of a degree are."""
+"""The same for a model that is to fly: sound of 0 to 30 dB from a disc below, more of it, and passes enough
+for the learning rate to come down again, which is where the last tenths of a degree are."""
 
 
 def read(path: Path | None, defaults: dict[str, dict[str, Any]] = PAPER) -> LabSettings:

@@ -272,8 +272,8 @@ def markdown(result: dict[str, Any]) -> str:
         *rows,
         "",
         "Mean |azimuth error| of one frame on seeds that were not trained on. *Best possible*: for "
-        "whole-sample arrivals the best answer for each combination of delays; else the Cramer-Rao bound with "
-        "the microphones' displacement in it. Rotors, wind and echoes can only add to it.",
+        "whole-sample arrivals the best answer for each combination of delays; else the Cramer-Rao bound "
+        "with the microphones' displacement in it. Rotors, wind and echoes can only add to it.",
         "",
         "![error over SNR](error.png)",
         "",
