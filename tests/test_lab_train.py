@@ -17,7 +17,7 @@ from locagen_edge.lab.settings import OWN, LabSettings, read
 from locagen_edge.lab.triangulation import least_squares
 from locagen_edge.lab.twin import with_twin
 from locagen_edge.models import read_manifest
-from locagen_edge.settings import Settings, load
+from locagen_edge.settings import load
 
 SQUARE = """
 [array]
@@ -149,7 +149,7 @@ def test_a_file_has_its_own_defaults_and_its_keys_go_first(tmp_path) -> None:
 
 @pytest.mark.parametrize("level", ["arrivals", "waveforms"])
 def test_heights_over_a_span_are_heard_at_both_levels(level) -> None:
-    """Delays shrink with the elevation's cosine: to nothing above the caller, and as without height far out."""
+    """Delays shrink with the elevation's cosine, which tells how high the array was."""
     s = with_twin(read(None, OWN), height_span_m=100.0, position_error_m=0.0, rounding="none", noise="none")
     s = dataclasses.replace(s, dataset=dataclasses.replace(s.dataset, level=level))
     data = draw(s, 1500, 3)
@@ -189,6 +189,6 @@ def test_least_squares_is_close_to_the_best_possible_where_nothing_is_rounded() 
     s = with_twin(read(None), rounding="none", noise="snr", snr_db=10.0)
     data = draw(s, 20_000, 1)
     best, found = best_deg(s, data), mean_error_deg(least_squares(s), data)
-    # of three independent arrivals least squares is the best there is; 20,000 samples tell 1 %
-    assert found == pytest.approx(best, rel=0.02)
-    assert isinstance(s, Settings)
+    # of three independent arrivals least squares of a plane wave is the best there is, but for callers within
+    # a few metres; 20,000 samples tell 1 %
+    assert found == pytest.approx(best, rel=0.03)

@@ -131,7 +131,7 @@ def test_silence_has_no_bearing():
 
 
 def test_torch_and_onnx_agree():
-    """Within 1e-5, float32's accuracy over some 70 sums; no paths of the machine that trained it are in it."""
+    """Within 1e-5, float32's accuracy over some 70 sums; the file holds no paths of the machine."""
     torch = pytest.importorskip("torch", reason="the lab extra is not installed")
     from locagen_edge.lab.export import answers_of, to_onnx
     from locagen_edge.lab.nets.mlp import mlp

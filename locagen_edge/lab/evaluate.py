@@ -234,7 +234,8 @@ def markdown(result: dict[str, Any]) -> str:
         f"| {row['label'].rpartition('/')[2]} | {row['file']} | {row['time_s']:.2f} | "
         f"{row['azimuth_deg']:.1f} | {_number(row['estimate_deg'], '.1f')} | "
         f"{_number(row['error_deg'], '+.2f')} | {row['twin_deg']:.2f} | {row['snr_db']:.0f} | "
-        f"{_number(row['range_m'], '.1f')} | {_number(row['estimate_m'], '.1f')} | {_number(row['error_m'], '+.2f')} |"
+        f"{_number(row['range_m'], '.1f')} | {_number(row['estimate_m'], '.1f')} | "
+        f"{_number(row['error_m'], '+.2f')} |"
         for row in result["labels"]
     ]
     lines += [
