@@ -119,20 +119,19 @@ def _row(label: Label, estimate: Estimate, fix: Any) -> dict[str, Any]:
 def _predict(s: LabSettings, rows: list[dict[str, Any]]) -> None:
     """Adds to every row what the twin does at its SNR and azimuth: mean |error|, its 95th percentile.
 
-    Where labels have ranges, the same of distance, at the median of all ranges.
+    Of labels with a range it stands at that range, to half an octave, and its distance counts too.
     """
     least, most = SNR_RANGE_DB
     at = [round(min(max(row["snr_db"], least), most) / STEP_DB) * STEP_DB for row in rows]
-    ranges = [row["range_m"] for row in rows if row["range_m"] is not None]
-    range_m = float(np.median(ranges)) if ranges else s.twin.range_m
+    ranges = [None if row["range_m"] is None else 2.0 ** round(math.log2(row["range_m"])) for row in rows]
+    places = list(zip(at, ranges, strict=True))
     swept = {
-        snr_db: _swept(s, snr_db, range_m, with_range=bool(ranges))
-        for snr_db in tqdm(sorted(set(at)), desc="twin", unit=" SNRs", disable=None)
+        place: _swept(s, *place) for place in tqdm(set(places), desc="twin", unit=" sweeps", disable=None)
     }
-    for row, snr_db in zip(rows, at, strict=True):
-        azimuth_deg, off_deg, off_m = swept[snr_db]
+    for row, place in zip(rows, places, strict=True):
+        azimuth_deg, off_deg, off_m = swept[place]
         near = np.abs((azimuth_deg - row["azimuth_deg"] + 180.0) % 360.0 - 180.0) <= NEAR_DEG
-        row["twin_snr_db"] = snr_db
+        row["twin_snr_db"], row["twin_range_m"] = place
         row["twin_deg"] = float(off_deg[near].mean())
         row["twin_95_deg"] = float(np.percentile(off_deg[near], 95))
         known = off_m[near][np.isfinite(off_m[near])]
@@ -140,13 +139,13 @@ def _predict(s: LabSettings, rows: list[dict[str, Any]]) -> None:
         row["twin_m"] = float(known.mean()) if len(known) else None
 
 
-def _swept(s: LabSettings, snr_db: float, range_m: float, with_range: bool) -> tuple[F64, F64, F64]:
+def _swept(s: LabSettings, snr_db: float, range_m: float | None) -> tuple[F64, F64, F64]:
     """Azimuths (n,) all round, the estimator's |errors| (n,) on the twin's frames, both in degrees, and
     those of the hyperbolic solver's range (n,) in metres, NaN where it cannot be known."""
     keys = {"noise": "snr", "snr_db": snr_db, "source": "sweep", "step_deg": SWEEP_STEP_DEG}
     here = dataclasses.replace(
         s,
-        twin=dataclasses.replace(s.twin, **keys, range_m=max(range_m, 0.5)),  # type: ignore[arg-type]
+        twin=dataclasses.replace(s.twin, **keys, range_m=max(range_m or s.twin.range_m, 0.5)),  # type: ignore[arg-type]
         scene=dataclasses.replace(s.scene, frames=1, lead_s=0.0, snr_span_db=0.0, snr_at_m=0.0),
         dataset=dataclasses.replace(s.dataset, level="waveforms", keep=()),
     )
@@ -159,9 +158,9 @@ def _swept(s: LabSettings, snr_db: float, range_m: float, with_range: bool) -> t
         tdoa = Tdoa(delay.astype(np.float64), sigma.astype(np.float64), peak.astype(np.float64))
         found = estimate(tdoa).azimuth_rad
         off.append(90.0 if found is None else abs(math.degrees(wrap(found - float(true)))))
-        fix = locate(tdoa).fix if with_range else None
+        fix = locate(tdoa).fix if range_m is not None else None
         known = fix is not None and fix.range_observable
-        off_m.append(abs(fix.range_m - range_m) if fix is not None and known else math.nan)
+        off_m.append(abs(fix.range_m - here.twin.range_m) if fix is not None and known else math.nan)
     return np.degrees(drawn["azimuth_rad"].astype(np.float64)) % 360.0, np.array(off), np.array(off_m)
 
 
@@ -254,7 +253,7 @@ def _distance(told: dict[str, Any]) -> list[str]:
     if not told["range_labels"]:
         return ["No label has a range, so distance is not compared."]
     return [
-        "| distance, hyperbolic solver | field | twin, same SNR and azimuth |",
+        "| distance, hyperbolic solver | field | twin, same SNR, azimuth and range |",
         "| --- | --- | --- |",
         f"| mean \\|difference\\| where it can be known, m | {_number(told['range_mean_m'], '.2f')} | "
         f"{_number(told['twin_range_mean_m'], '.2f')} |",

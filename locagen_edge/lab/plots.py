@@ -296,7 +296,7 @@ def field(axes: Axes, result: dict[str, Any]) -> None:
         title=f"{len(rows)} labels, estimator {result['estimator']}",
     )
     axes.set_xticks(range(0, 361, 45))
-    axes.legend()
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncol=3)
 
 
 FIGURES: dict[str, tuple[str, Drawing, tuple[float, float]]] = {
