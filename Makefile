@@ -2,6 +2,11 @@
 
 PYTHON ?= python3
 VENV   ?= .venv
+# where the CPU build of torch is found (TORCH_INDEX= for the usual index, with CUDA on x86-64)
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+ifneq ($(DESTDIR),)
+override DESTDIR := $(abspath $(DESTDIR))
+endif
 BIN    := $(VENV)/bin
 CFLAGS_C := -std=gnu11 -Wall -Wextra -Werror -fno-math-errno -fno-trapping-math
 KERNEL_C := $(filter-out csrc/test_kernel.c, $(wildcard csrc/*.c))
@@ -22,6 +27,13 @@ define need
 	fi
 endef
 
+# What Python itself may lack on Debian.
+define python-needs
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "$(PYTHON) is too old: 3.11 or later is needed"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { $(MAKE) -s .python-venv; $(PYTHON) -c 'import ensurepip'; }
+	@$(PYTHON) -c 'import os, sysconfig; raise SystemExit(not os.path.exists(sysconfig.get_path("include") + "/Python.h"))' || $(MAKE) -s .python-dev
+endef
+
 .PHONY: help
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -33,9 +45,7 @@ run: $(VENV)/.flight ## the daemon on a synthetic drone scene; SECONDS=10 ends i
 	@exec $(BIN)/locagen-edge run --settings systemd/locagen-edge.toml $(if $(SECONDS),--seconds $(SECONDS))
 
 $(VENV)/.flight: $(KERNEL)
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "$(PYTHON) is too old: 3.11 or later is needed"; exit 1; }
-	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { $(MAKE) -s .python-venv; $(PYTHON) -c 'import ensurepip'; }
-	@$(PYTHON) -c 'import os, sysconfig; raise SystemExit(not os.path.exists(sysconfig.get_path("include") + "/Python.h"))' || $(MAKE) -s .python-dev
+	$(python-needs)
 	$(call need,libportaudio2,capture from microphones)
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
 	@echo "setting up $(VENV) (once)"
@@ -68,6 +78,8 @@ format: $(VENV)/.dev ## rewrites the sources in the one format, the sample setti
 
 $(VENV)/.dev: $(VENV)/.flight
 	@echo "setting up $(VENV) for development (once)"
+	@# the CPU build where its index can be reached; where not, whatever the usual index has
+	@test -z "$(TORCH_INDEX)" || $(BIN)/pip install -q --no-deps --retries 1 --timeout 15 --extra-index-url $(TORCH_INDEX) torch==2.13.0 2>/dev/null || true
 	@$(BIN)/pip install -q -e '.[dev,lab,bench]'
 	@touch $@
 
@@ -93,6 +105,7 @@ nightly: $(VENV)/.dev csrc-test csrc-test-aarch64 ## the tests with many more an
 bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(call need,libfftw3-dev,comparing with FFTW)
 	$(BIN)/python bench/bench_kernel.py
+	$(BIN)/python bench/bench_steered.py
 	$(BIN)/python bench/bench_pipeline.py
 	$(BIN)/python bench/bench_accuracy.py --trials 100
 	$(BIN)/python bench/bench_twin.py
@@ -109,9 +122,13 @@ paper: $(VENV)/.dev ## repeats the paper's experiments, into paper-report/ (some
 
 .PHONY: install
 install: ## as root: program, unit, user and sample settings; DESTDIR is honoured
+	$(python-needs)
+	$(call need,libportaudio2,capture from microphones)
 	install -d $(DESTDIR)$(LIB_DIR) $(DESTDIR)$(ETC_DIR) $(DESTDIR)$(SYSTEMD_DIR) $(DESTDIR)$(SYSUSERS_DIR)
 	$(PYTHON) -m venv $(DESTDIR)$(LIB_DIR)
-	$(DESTDIR)$(LIB_DIR)/bin/pip install -q .
+	@# built from a copy: root leaves nothing behind in the checkout
+	@copy=$$(mktemp -d) && cp -r csrc locagen_edge models pyproject.toml setup.py MANIFEST.in README.md LICENSE $$copy && \
+	    rm -f $$copy/locagen_edge/*.so && $(DESTDIR)$(LIB_DIR)/bin/pip install -q $$copy; ok=$$?; rm -rf $$copy; exit $$ok
 	@# scripts name their interpreter: the place where it will be, not where it is packed
 	@test -z "$(DESTDIR)" || grep -rlI '^#!$(DESTDIR)' $(DESTDIR)$(LIB_DIR)/bin | xargs -r sed -i '1s|^#!$(DESTDIR)|#!|'
 	install -m 644 systemd/locagen-edge.service $(DESTDIR)$(SYSTEMD_DIR)/

@@ -221,7 +221,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--trials", type=int, default=500, help="per cell (default 500)")
     parser.add_argument("--quick", action="store_true", help="10 trials of three cells")
-    parser.add_argument("--output", type=Path, default=report.RESULTS / "accuracy.json")
+    parser.add_argument("--output", type=Path, default=report.default("accuracy"))
     arguments = parser.parse_args()
     names = ["white +10 dB", "speech +0 dB", "scream -5 dB under rotors"] if arguments.quick else list(CELLS)
     results = {}

@@ -56,7 +56,7 @@ def measure(rounds: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="200 hops instead of 4,000")
-    parser.add_argument("--output", type=Path, default=report.RESULTS / "pipeline.json")
+    parser.add_argument("--output", type=Path, default=report.default("pipeline"))
     arguments = parser.parse_args()
     results = measure(200 if arguments.quick else 4000)
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -20,6 +20,11 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "bench" / "results"
 
 
+def default(name: str) -> Path:
+    """Where a benchmark's report goes unless it is told otherwise: one file per kind of machine."""
+    return RESULTS / f"{name}-{platform.machine()}.json"
+
+
 def _output(*command: str) -> str:
     try:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)

@@ -22,8 +22,8 @@ CFLAGS = [
     "-Wall",
     "-Wextra",
 ]
-SOURCES = ["gcc_phat.c", "fft.c", "frame_quad.c", "frame_avx2.c"]
-HEADERS = ["locagen.h", "gcc_phat.h", "fft.h", "lanes.h", "fft_passes.h", "frame_path.h"]
+SOURCES = ["gcc_phat.c", "steering.c", "spectrum.c", "fft.c", "frame_quad.c", "frame_avx2.c"]
+HEADERS = sorted(path.name for path in HERE.glob("*.h"))
 
 header = (HERE / "locagen.h").read_text(encoding="utf-8")
 match = re.search(r"/\* \[python\].*?\*/(.*?)/\* \[/python\] \*/", header, re.DOTALL)

@@ -45,15 +45,27 @@ size_t locagen_fft_floats(int32_t frame)
     return floats + (points / 2 + 2) * 8; /* parting */
 }
 
-void locagen_fft_init(locagen_fft *fft, int32_t frame, double gain, float *memory)
+double locagen_window(int32_t n, int32_t frame, double taper)
 {
+    double flank = taper * frame / 2, from_edge = n < frame - n ? n : frame - n;
+    return from_edge < flank ? 0.5 - 0.5 * cos(TWO_PI / 2 * from_edge / flank) : 1;
+}
+
+void locagen_fft_init(locagen_fft *fft, int32_t frame, double taper, float *memory)
+{
+    /* 2 / (N sum(w^2)) |X|^2, and a half for the parting of the real bins. */
+    double squares = 0;
+    for (int32_t n = 0; n < frame; n++)
+        squares += pow(locagen_window(n, frame, taper), 2);
+    double gain = 0.5 * sqrt(2 / (frame * squares));
+
     fft->points = frame / 2;
     fft->passes = radices(fft->points, fft->radix);
     float *next = memory;
 
     fft->window = next;
     for (int32_t n = 0; n < frame; n++)
-        *next++ = (float)(gain * (0.5 - 0.5 * cos(TWO_PI * n / frame)));
+        *next++ = (float)(gain * locagen_window(n, frame, taper));
 
     /* Points come from the samples in the order 0, 2, 1, 3 of each four (see fetch in fft_passes.h);
      * the twiddles stand in that order, two points side by side, every one four times. */

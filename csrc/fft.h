@@ -24,7 +24,11 @@ typedef struct {
 /* Floats of table for a frame of this many samples. */
 size_t locagen_fft_floats(int32_t frame);
 
-/* Lays the tables into `memory`. The window is Hann's, periodic, times `gain`. */
-void locagen_fft_init(locagen_fft *fft, int32_t frame, double gain, float *memory);
+/* Tukey's window, periodic: a share `taper` of it are cosine flanks; 1 is Hann's. */
+double locagen_window(int32_t n, int32_t frame, double taper);
+
+/* Lays the tables into `memory`. The window is locagen_window, scaled so that the squared magnitude of a bin
+ * is its power: those of a full-scale sine add up to a half. */
+void locagen_fft_init(locagen_fft *fft, int32_t frame, double taper, float *memory);
 
 #endif

@@ -8,11 +8,14 @@
 #endif
 #define WIDTH 8
 #include "frame_path.h"
+#include "steering_path.h"
 
 int locagen_frame_avx2(const state *s, const float *in, float *correlation, float *power)
 {
     return frame_path(s, in, correlation, power);
 }
+
+const locagen_steer_paths locagen_steer_avx2 = {listen, add_frame, whiten_band, score_groups};
 #if defined(__clang__)
 #pragma clang attribute pop
 #endif

@@ -3,30 +3,10 @@
  * Included once for each vector width by a file that defines WIDTH. Lanes are microphones up to the
  * products and pairs behind them; in the last step, where a few pairs meet many lags, lanes are lags.
  */
-#include "fft_passes.h"
 #include "gcc_phat.h"
+#include "spectrum_path.h"
 
 #include <float.h>
-
-/* Sum over the band of each lane's squared magnitudes. */
-STEP quad band_power(const state *s, spectrum bins)
-{
-    /* Four sums: one alone would wait for each addition to end. */
-    vec sum[4] = {0};
-    long at = 4 * (s->first_bin & ~1L), end = 4 * ((s->last_bin | 1L) + 1);
-    for (; at + 2 * WIDTH <= end; at += 2 * WIDTH)
-        for (int n = 0; n < 2; n++) {
-            vec re = load(bins.re + at + n * WIDTH), im = load(bins.im + at + n * WIDTH);
-            sum[2 * n] += re * re;
-            sum[2 * n + 1] += im * im;
-        }
-    for (; at < end; at += WIDTH) {
-        vec re = load(bins.re + at), im = load(bins.im + at);
-        sum[0] += re * re;
-        sum[1] += im * im;
-    }
-    return folded((sum[0] + sum[1]) + (sum[2] + sum[3]));
-}
 
 /* 1 / sqrt(x) for x >= 0, finite: the first guess from the exponent's bits (Lomont 2003, "Fast inverse
  * square root"), good to 3.4 %, times the cubic in h = x guess^2 that is nearest to 1 / sqrt(h) for the h
@@ -42,8 +22,8 @@ INLINE vec inverse_root(vec x)
 STEP void whiten(const state *s, quad floor, spectrum bins)
 {
     vec floors = both(floor);
-    long end = 4 * ((s->last_bin | 1L) + 1);
-    for (long at = 4 * (s->first_bin & ~1L); at < end; at += WIDTH) {
+    long end = 4 * ((s->spectrum.last_bin | 1L) + 1);
+    for (long at = 4 * (s->spectrum.first_bin & ~1L); at < end; at += WIDTH) {
         vec re = load(bins.re + at), im = load(bins.im + at);
         vec scale = inverse_root(re * re + im * im + floors);
         store(bins.re + at, re * scale);
@@ -51,43 +31,18 @@ STEP void whiten(const state *s, quad floor, spectrum bins)
     }
 }
 
-INLINE void clear_lane(spectrum bins, long first, long last, int lane)
-{
-    for (long k = first; k <= last; k++)
-        bins.re[4 * k + lane] = bins.im[4 * k + lane] = 0.0f;
-}
-
 /* Unit bins of one group of up to four microphones; returns the mask of those that are not finite. */
-INLINE int unit_bins(const state *s, const float *in, int mics, spectrum work, spectrum bins, float *power)
+INLINE int unit_bins(const state *s, const float *in, int group, float *power)
 {
-    /* A lane without a microphone repeats the first one, which is in memory anyhow; nobody reads it. */
-    const float *rows[4];
-    for (int lane = 0; lane < 4; lane++)
-        rows[lane] = in + (lane < mics ? lane : 0) * (long)s->samples;
-    real_fft(&s->fft, rows, s->part_low, s->part_high, work, bins);
-
-    long first = s->first_bin & ~1L, last = s->last_bin | 1L;
-    for (int lane = 0; lane < 4; lane++) { /* neighbours outside the band that share a vector with it */
-        if (first < s->first_bin)
-            clear_lane(bins, first, first, lane);
-        if (last > s->last_bin)
-            clear_lane(bins, last, last, lane);
-    }
-    quad sum = band_power(s, bins);
-    int bad = 0;
-    for (int lane = 0; lane < mics; lane++) {
-        /* Half of the range is left for the floor. NaN fails the comparison too. */
-        if (!(sum[lane] < FLT_MAX / 2)) {
-            bad |= 1 << lane;
-            sum[lane] = 0.0f;
-            clear_lane(bins, first, last, lane);
-        }
-        power[lane] = sum[lane];
-    }
+    /* Half of the range is left for the floor. */
+    quad sum;
+    int bad = group_bins(&s->spectrum, in, group, FLT_MAX / 2, &sum);
+    for (int lane = 0; lane < 4 && 4 * group + lane < s->spectrum.mics; lane++)
+        power[4 * group + lane] = sum[lane];
     quad floor = sum * (s->relative_floor * s->bin_share);
     for (int lane = 0; lane < 4; lane++)
         floor[lane] = floor[lane] > s->floor ? floor[lane] : s->floor;
-    whiten(s, floor, bins);
+    whiten(s, floor, (spectrum){s->spectrum.bins_re[group], s->spectrum.bins_im[group]});
     return bad;
 }
 
@@ -120,7 +75,7 @@ INLINE void product(spectrum i, spectrum j, long at, const enum turn turn, vec *
 INLINE void coarse_bins(const state *s, spectrum i, spectrum j, const enum turn turn, quad direction,
                         spectrum coarse)
 {
-    long first = s->first_bin & ~1L, end = (s->last_bin | 1L) + 1;
+    long first = s->spectrum.first_bin & ~1L, end = (s->spectrum.last_bin | 1L) + 1;
     if (s->decimation == 1) {
         for (long k = first; k < end; k += QUADS) {
             vec re, im;
@@ -249,18 +204,14 @@ INLINE void lags(const state *s, const locagen_product *p, spectrum coarse, floa
 
 INLINE int frame_path(const state *s, const float *in, float *correlation, float *power)
 {
-    spectrum work = {s->work_re, s->work_im}, coarse = {s->coarse_re, s->coarse_im};
+    spectrum coarse = {s->coarse_re, s->coarse_im};
     int bad = 0;
-    for (int group = 0; group < s->groups; group++) {
-        int mics = s->mics - 4 * group < 4 ? s->mics - 4 * group : 4;
-        spectrum bins = {s->bins_re[group], s->bins_im[group]};
-        const float *rows = in + 4 * group * (long)s->samples;
-        bad |= unit_bins(s, rows, mics, work, bins, power + 4 * group) << 4 * group;
-    }
+    for (int group = 0; group < s->spectrum.groups; group++)
+        bad |= unit_bins(s, in, group, power) << 4 * group;
     for (int n = 0; n < s->products; n++) {
         const locagen_product *p = &s->product[n];
-        spectrum i = {s->bins_re[p->group_i], s->bins_im[p->group_i]};
-        spectrum j = {s->bins_re[p->group_j], s->bins_im[p->group_j]};
+        spectrum i = {s->spectrum.bins_re[p->group_i], s->spectrum.bins_im[p->group_i]};
+        spectrum j = {s->spectrum.bins_re[p->group_j], s->spectrum.bins_im[p->group_j]};
         quad direction = load_quad(p->direction);
         COARSE_BINS_OF[p->turn](s, i, j, direction, coarse);
         lags(s, p, coarse, correlation);

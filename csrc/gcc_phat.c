@@ -23,27 +23,7 @@ static const double PI = 3.14159265358979323846;
  * stronger one. With four taps instead of six it would be 4e-4. */
 static const double LEAST_OVERSAMPLING = 3.9;
 
-enum {
-    LINE = 64,           /* bytes of a cache line */
-    MOST_DECIMATION = 64 /* beyond it nothing is left to save */
-};
-
-typedef struct {
-    char *base; /* null: only count */
-    size_t used;
-} arena;
-
-static float *take(arena *a, size_t floats)
-{
-    float *at = a->base ? (float *)(void *)(a->base + a->used) : NULL;
-    a->used += (floats * sizeof(float) + LINE - 1) / LINE * LINE;
-    return at;
-}
-
-static state *aligned(const void *memory)
-{
-    return (state *)(((uintptr_t)memory + LINE - 1) & ~(uintptr_t)(LINE - 1));
-}
+enum { MOST_DECIMATION = 64 }; /* beyond it nothing is left to save */
 
 static int in_unit_interval(float x)
 {
@@ -54,17 +34,9 @@ static int check(const locagen_gcc_config *c)
 {
     if (c == NULL)
         return LOCAGEN_E_NULL;
-    if (c->mics < 2 || c->mics > 8)
-        return LOCAGEN_E_MICS;
-    if (c->frame < 256 || c->frame > 4096 || (c->frame & (c->frame - 1)) != 0)
-        return LOCAGEN_E_FRAME;
-    if (!(c->rate_hz > 0.0f && c->rate_hz <= FLT_MAX))
-        return LOCAGEN_E_RATE;
-    if (!(c->band_low_hz > 0.0f && c->band_low_hz < c->band_high_hz && c->band_high_hz < c->rate_hz / 2))
-        return LOCAGEN_E_BAND;
-    double bins_per_hz = c->frame / (double)c->rate_hz;
-    if (floor(c->band_high_hz * bins_per_hz) - ceil(c->band_low_hz * bins_per_hz) + 1 < 8)
-        return LOCAGEN_E_BAND;
+    int error = locagen_spectrum_check(c->mics, c->frame, c->rate_hz, c->band_low_hz, c->band_high_hz);
+    if (error != LOCAGEN_OK)
+        return error;
     if (c->oversample < 1 || c->oversample > 64 || c->lags < 1 || c->lags >= c->frame / 4 * c->oversample)
         return LOCAGEN_E_LAGS;
     if (!in_unit_interval(c->floor) || !in_unit_interval(c->relative_floor))
@@ -89,9 +61,9 @@ static void add_product(state *s, int group_i, int group_j, enum turn turn, uint
     for (int lane = 0; lane < 4; lane++) {
         int i = 4 * group_i + lane, j = 4 * group_j + TURN[turn][lane];
         p.direction[lane] = i < j ? 1.0f : -1.0f;
-        if (i == j || i >= s->mics || j >= s->mics)
+        if (i == j || i >= s->spectrum.mics || j >= s->spectrum.mics)
             continue;
-        int row = i < j ? pair_row(s->mics, i, j) : pair_row(s->mics, j, i);
+        int row = i < j ? pair_row(s->spectrum.mics, i, j) : pair_row(s->spectrum.mics, j, i);
         if (*held >> row & 1)
             continue;
         *held |= UINT32_C(1) << row;
@@ -105,15 +77,15 @@ static void add_product(state *s, int group_i, int group_j, enum turn turn, uint
 static void choose_products(state *s)
 {
     uint32_t held = 0;
-    for (int group = 0; group < s->groups; group++) {
-        if (s->mics - 4 * group < 4) {
+    for (int group = 0; group < s->spectrum.groups; group++) {
+        if (s->spectrum.mics - 4 * group < 4) {
             add_product(s, group, group, TURN_RING3, &held);
         } else {
             add_product(s, group, group, TURN_1, &held);
             add_product(s, group, group, TURN_2, &held);
         }
     }
-    for (enum turn turn = TURN_0; s->groups == 2 && turn <= TURN_3; turn++)
+    for (enum turn turn = TURN_0; s->spectrum.groups == 2 && turn <= TURN_3; turn++)
         add_product(s, 0, 1, turn, &held);
 }
 
@@ -127,43 +99,30 @@ static int choose_decimation(const locagen_gcc_config *c)
 }
 
 /* Everything but the tables' contents; with a null base only the arena's count is meant. */
-static void lay_out(state *s, const locagen_gcc_config *c, arena *a)
+static void lay_out(state *s, const locagen_gcc_config *c, locagen_arena *a)
 {
-    double bins_per_hz = c->frame / (double)c->rate_hz;
-    int points = c->frame / 2;
     memset(s, 0, sizeof *s);
-    s->mics = c->mics;
-    s->groups = (c->mics + 3) / 4;
-    s->samples = c->frame;
+    locagen_spectrum_lay_out(&s->spectrum, c->mics, c->frame, c->rate_hz, c->band_low_hz, c->band_high_hz, a);
     s->lags = c->lags;
     s->floor = c->floor;
     s->relative_floor = c->relative_floor;
-    s->first_bin = (int32_t)ceil(c->band_low_hz * bins_per_hz);
-    s->last_bin = (int32_t)floor(c->band_high_hz * bins_per_hz);
-    s->bin_share = 1.0f / (float)(s->last_bin - s->first_bin + 1);
-    int mirror_first = points - s->last_bin, mirror_last = points - s->first_bin;
-    s->part_low = (s->first_bin < mirror_first ? s->first_bin : mirror_first) & ~1;
-    s->part_high = s->last_bin < mirror_last ? s->last_bin : mirror_last;
-    if (s->part_high > points / 2)
-        s->part_high = points / 2;
+    s->bin_share = 1.0f / (float)(s->spectrum.last_bin - s->spectrum.first_bin + 1);
     choose_products(s);
 
     s->decimation = choose_decimation(c);
-    s->coarse = s->decimation == 1 ? (s->last_bin | 1) - (s->first_bin & ~1) + 1
-                                   : s->last_bin / s->decimation - s->first_bin / s->decimation + TAPS;
+    int first = s->spectrum.first_bin, last = s->spectrum.last_bin;
+    s->coarse = s->decimation == 1 ? (last | 1) - (first & ~1) + 1
+                                   : last / s->decimation - first / s->decimation + TAPS;
     s->half = s->lags < BLOCK_HALF ? s->lags : BLOCK_HALF;
     s->blocks = 2 * ((s->lags + BLOCK_HALF) / (2 * BLOCK_HALF + 1)) + 1;
     s->table_lags = (s->half + 16) / 16 * 16;
 
-    size_t quads = 4 * (size_t)(points + 2);
-    s->work_re = take(a, quads), s->work_im = take(a, quads);
-    for (int group = 0; group < s->groups; group++)
-        s->bins_re[group] = take(a, quads), s->bins_im[group] = take(a, quads);
-    s->weights = take(a, 4 * TAPS * (size_t)s->decimation);
-    s->coarse_re = take(a, 4 * (size_t)s->coarse), s->coarse_im = take(a, 4 * (size_t)s->coarse);
-    s->table = take(a, 2 * (size_t)s->coarse * (size_t)s->table_lags);
-    s->start = take(a, 2 * (size_t)s->coarse), s->step = take(a, 2 * (size_t)s->coarse);
-    s->gain = take(a, 2 * (size_t)s->lags + 1);
+    s->weights = locagen_take(a, 4 * TAPS * (size_t)s->decimation);
+    s->coarse_re = locagen_take(a, 4 * (size_t)s->coarse);
+    s->coarse_im = locagen_take(a, 4 * (size_t)s->coarse);
+    s->table = locagen_take(a, 2 * (size_t)s->coarse * (size_t)s->table_lags);
+    s->start = locagen_take(a, 2 * (size_t)s->coarse), s->step = locagen_take(a, 2 * (size_t)s->coarse);
+    s->gain = locagen_take(a, 2 * (size_t)s->lags + 1);
 }
 
 /* Modified Bessel function I0, by its power series: exact to double precision for the x < 19 used here. */
@@ -179,8 +138,8 @@ static double bessel_i0(double x)
 
 static void fill_spreading(state *s, double span)
 {
-    double frame = s->samples, decimation = s->decimation;
-    double bins = s->last_bin - s->first_bin + 1;
+    double frame = s->spectrum.samples, decimation = s->decimation;
+    double bins = s->spectrum.last_bin - s->spectrum.first_bin + 1;
     double shape = TAPS * PI * (1 - span / 2 * decimation / frame);
     for (int tap = 0; tap < TAPS; tap++)
         for (int f = 0; f < s->decimation; f++) {
@@ -208,10 +167,10 @@ static void fill_synthesis(state *s, int oversample)
     int block_lags = 2 * BLOCK_HALF + 1;
     for (int c = 0; c < s->coarse; c++) {
         /* Coarse bins lie half a bin below their block, so that no bin falls on the window's edge. */
-        double bin = (s->first_bin & ~1) + c;
+        double bin = (s->spectrum.first_bin & ~1) + c;
         if (s->decimation > 1)
-            bin = (s->first_bin / s->decimation - (TAPS / 2 - 1) + c) * s->decimation - 0.5;
-        double turns = bin / ((double)s->samples * oversample);
+            bin = (s->spectrum.first_bin / s->decimation - (TAPS / 2 - 1) + c) * s->decimation - 0.5;
+        double turns = bin / ((double)s->spectrum.samples * oversample);
         float *row = s->table + 2 * (size_t)c * (size_t)s->table_lags;
         for (int l = 0; l < s->table_lags; l++)
             put_phasor(&row[l], &row[s->table_lags + l], turns * l);
@@ -225,11 +184,10 @@ size_t locagen_gcc_sizeof(const locagen_gcc_config *config)
     if (check(config) != LOCAGEN_OK)
         return 0;
     state s;
-    arena count = {NULL, 0};
-    take(&count, sizeof s / sizeof(float) + 1);
+    locagen_arena count = {NULL, 0};
+    locagen_take(&count, sizeof s / sizeof(float) + 1);
     lay_out(&s, config, &count);
-    take(&count, locagen_fft_floats(config->frame));
-    return count.used + LINE - 1;
+    return count.used + LOCAGEN_LINE - 1;
 }
 
 int locagen_gcc_init(locagen_gcc *memory, const locagen_gcc_config *config)
@@ -238,15 +196,12 @@ int locagen_gcc_init(locagen_gcc *memory, const locagen_gcc_config *config)
     if (error != LOCAGEN_OK)
         return error;
     memset(memory, 0, locagen_gcc_sizeof(config));
-    state *s = aligned(memory);
-    arena room = {(char *)s, 0};
-    take(&room, sizeof *s / sizeof(float) + 1);
+    state *s = locagen_aligned(memory);
+    locagen_arena room = {(char *)s, 0};
+    locagen_take(&room, sizeof *s / sizeof(float) + 1);
     lay_out(s, config, &room);
 
-    /* With this gain the squared magnitude of a bin is its power: 2 / (N sum(w^2)) |X|^2, where the squares
-     * of Hann's window add up to 3 N / 8, and a half goes to the parting of the real bins. */
-    double gain = 0.5 * sqrt(2 / (config->frame * (0.375 * config->frame)));
-    locagen_fft_init(&s->fft, config->frame, gain, take(&room, locagen_fft_floats(config->frame)));
+    locagen_spectrum_init(&s->spectrum, 1.0); /* Hann */
     fill_spreading(s, 2.0 * config->lags / config->oversample);
     fill_synthesis(s, config->oversample);
 
@@ -262,7 +217,7 @@ int locagen_gcc_process(locagen_gcc *memory, const float *in, float *correlation
 {
     if (memory == NULL || in == NULL || correlation == NULL || power == NULL)
         return LOCAGEN_E_NULL;
-    const state *s = aligned(memory);
+    const state *s = locagen_aligned(memory);
     return s->frame(s, in, correlation, power);
 }
 
@@ -285,6 +240,22 @@ const char *locagen_strerror(int code)
         return "floors: must be at least 0 and below 1";
     case LOCAGEN_E_NULL:
         return "a pointer is null";
+    case LOCAGEN_E_HOP:
+        return "hop: must be 0 (frames that do not overlap) or at least an eighth of the frame";
+    case LOCAGEN_E_TAPER:
+        return "taper: must be 0 to 1";
+    case LOCAGEN_E_SMOOTH:
+        return "smooth_bins: must be 0 to 64";
+    case LOCAGEN_E_NOISE:
+        return "noise: loading must be 1e-5 to 1, floor 1e-15 to 1";
+    case LOCAGEN_E_ARRAY:
+        return "array: positions must lie within 10 m, not all in one place; speed of sound 100 to 2000 m/s";
+    case LOCAGEN_E_GRID:
+        return "grid: must have 8 to 720 azimuths and 2 to 180 elevations";
+    case LOCAGEN_E_SHARE:
+        return "share: must be 0 to 1";
+    case LOCAGEN_E_COUNT:
+        return "sources: at least one must be asked for";
     default:
         return "unknown error";
     }

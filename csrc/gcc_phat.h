@@ -1,8 +1,7 @@
 /* gcc_phat.h - the state of the kernel, shared by its set-up and by the path of a frame. */
 #ifndef LOCAGEN_GCC_PHAT_H
 #define LOCAGEN_GCC_PHAT_H
-#include "fft.h"
-#include "locagen.h"
+#include "spectrum.h"
 
 enum {
     TAPS = 6,       /* coarse bins that one bin is spread over */
@@ -24,13 +23,9 @@ typedef struct {
 
 typedef struct state {
     int (*frame)(const struct state *, const float *in, float *correlation, float *power);
-    int32_t mics, groups, samples, lags;
+    locagen_spectrum spectrum;
+    int32_t lags;
     float floor, relative_floor, bin_share; /* bin_share: 1 / bins in the band */
-    int32_t first_bin, last_bin;            /* the band */
-    int32_t part_low, part_high;            /* what the real FFT is asked for */
-    locagen_fft fft;
-    float *work_re, *work_im;         /* quads */
-    float *bins_re[2], *bins_im[2];   /* quads, of each group of four microphones */
     int32_t products;
     locagen_product product[8];       /* eight microphones: 2 in each group, 4 across */
     int32_t decimation;               /* bins per coarse bin, a power of two; 1: no spreading */

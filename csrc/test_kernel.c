@@ -5,6 +5,7 @@
  * one is what flies. Prints what failed and one line at the end.
  */
 #include "gcc_phat.h"
+#include "steering.h"
 
 #include <math.h>
 #include <stdio.h>
@@ -29,6 +30,8 @@ typedef int (*path)(const state *, const float *, float *, float *);
 
 static path paths[2] = {locagen_frame_quad};
 static int path_count = 1;
+
+static const locagen_steer_paths *steer_paths[2] = {&locagen_steer_quad};
 
 static const locagen_gcc_config TRIANGLE = {
     .mics = 3, .frame = 1024, .lags = 63, .oversample = 16, .rate_hz = 10000.0f, .band_low_hz = 300.0f,
@@ -320,24 +323,354 @@ static void test_refusals(void)
     CHECK(locagen_gcc_process(b.kernel, b.in, NULL, b.power) == LOCAGEN_E_NULL, "no correlation");
     CHECK(locagen_gcc_process(b.kernel, b.in, b.correlation, NULL) == LOCAGEN_E_NULL, "no power");
     tear_down(&b);
-    for (int code = -8; code <= 1; code++)
-        CHECK(strlen(locagen_strerror(code)) > 5, "code %d", code);
+    for (int code = LOCAGEN_E_COUNT - 1; code <= 1; code++) {
+        const char *words = locagen_strerror(code);
+        CHECK(strlen(words) > 5, "code %d", code);
+        CHECK((strcmp(words, locagen_strerror(INT32_MIN)) == 0) == (code < LOCAGEN_E_COUNT), "code %d", code);
+    }
+}
+
+/* --- the steered search */
+
+static const locagen_steer_config STEERED = {
+    .mics = 3, .frame = 512, .hop = 256, .smooth_bins = 6, .azimuths = 60, .elevations = 7, .rate_hz = 10000.0f,
+    .band_low_hz = 300.0f, .band_high_hz = 4700.0f, .taper = 0.1f, .loading = 1e-3f, .floor = 1e-12f,
+    .speed_m_s = 343.0f,
+    .positions_m = {0.0577f, 0.0f, 0.0f, -0.0289f, 0.05f, 0.0f, -0.0289f, -0.05f, 0.0f, 0.0f, 0.0f, -0.08f,
+                    0.05f, 0.05f, 0.02f, -0.05f, 0.03f, 0.03f, 0.01f, -0.04f, -0.05f, 0.02f, 0.02f, 0.06f},
+};
+
+typedef struct {
+    locagen_steer_config config;
+    char *memory;
+    locagen_steer *kernel;
+    steer *state;
+    int bins;
+    float *in, *power, *map;
+    locagen_source *sources;
+} steer_bench;
+
+static steer_bench steer_set_up(locagen_steer_config config, const locagen_steer_paths *chosen)
+{
+    enum { MISALIGNED = 3 };
+    steer_bench b = {.config = config};
+    size_t bytes = locagen_steer_sizeof(&config);
+    b.memory = allocate(bytes + MISALIGNED);
+    memset(b.memory, 0xA5, bytes + MISALIGNED);
+    b.kernel = (locagen_steer *)(b.memory + MISALIGNED);
+    int code = locagen_steer_init(b.kernel, &config);
+    CHECK(code == 0, "init gave %d", code);
+    CHECK(memcmp(b.memory, "\xA5\xA5\xA5", MISALIGNED) == 0, "init wrote before its memory");
+    b.state = locagen_aligned(b.kernel);
+    b.state->paths = chosen;
+    b.bins = locagen_steer_bin_count(b.kernel);
+    b.in = allocate(sizeof(float) * (size_t)(config.mics * config.frame));
+    b.power = allocate(sizeof(float) * (size_t)config.mics);
+    b.map = allocate(sizeof(float) * (size_t)(config.azimuths * config.elevations));
+    b.sources = allocate(sizeof(locagen_source) * (size_t)config.mics);
+    return b;
+}
+
+static void steer_tear_down(steer_bench *b)
+{
+    free(b->memory);
+    free(b->in);
+    free(b->power);
+    free(b->map);
+    free(b->sources);
+}
+
+static void add_hiss(const steer_bench *b, float level)
+{
+    for (int n = 0; n < b->config.mics * b->config.frame; n++)
+        b->in[n] += level * uniform();
+}
+
+/* Forty tones of random phase over the band, as a plane wave. */
+static void add_wave(const steer_bench *b, double azimuth, double elevation, float level)
+{
+    const locagen_steer_config *c = &b->config;
+    const double two_pi = 6.283185307179586;
+    double u[3] = {cos(elevation) * cos(azimuth), cos(elevation) * sin(azimuth), -sin(elevation)};
+    for (int tone = 0; tone < 40; tone++) {
+        double f = c->band_low_hz + (c->band_high_hz - c->band_low_hz) * (tone + 0.5) / 40;
+        double phase = two_pi * (double)uniform();
+        for (int m = 0; m < c->mics; m++) {
+            const float *p = c->positions_m + 3 * m;
+            double early = (p[0] * u[0] + p[1] * u[1] + p[2] * u[2]) / c->speed_m_s;
+            for (int n = 0; n < c->frame; n++)
+                b->in[m * c->frame + n] += level * (float)cos(phase + two_pi * f * (n / c->rate_hz + early));
+        }
+    }
+}
+
+static void be_silent(const steer_bench *b)
+{
+    memset(b->in, 0, sizeof(float) * (size_t)(b->config.mics * b->config.frame));
+}
+
+static void learn_hiss(const steer_bench *b, int frames)
+{
+    for (int n = 0; n < frames; n++) {
+        be_silent(b);
+        add_hiss(b, 0.1f);
+        CHECK(locagen_steer_listen(b->kernel, b->in, b->power) == 0, "hiss is finite");
+        CHECK(locagen_steer_learn(b->kernel, 1.0f / (float)(n + 1)) == 0, "learnt");
+    }
+}
+
+static int all_finite(const locagen_source *source)
+{
+    const float *values = &source->azimuth_rad;
+    int finite = 1;
+    for (size_t n = 0; n < sizeof *source / sizeof *values; n++)
+        finite &= isfinite(values[n]) != 0;
+    return finite;
+}
+
+/* Degrees between a found direction and the true one. */
+static double off_by(const locagen_source *s, double azimuth, double elevation)
+{
+    double cosine = cos((double)s->elevation_rad) * cos(elevation) * cos((double)s->azimuth_rad - azimuth) +
+                    sin((double)s->elevation_rad) * sin(elevation);
+    return acos(fmin(1, cosine)) * 57.29577951308232;
+}
+
+static void test_steered_angles(const locagen_steer_paths *chosen)
+{
+    /* mics, frame, smooth_bins, band, grid: flat and not, grids that fill no group of directions, thinning or none,
+     * averages as wide as the band. */
+    static const struct {
+        int mics, frame, smooth, azimuths, elevations;
+        float low, high, taper;
+    } cases[] = {
+        {3, 512, 6, 60, 7, 300, 4700, 0.1f},   {3, 1024, 4, 61, 9, 300, 4700, 1.0f},  {4, 256, 0, 41, 13, 310, 4690, 0.0f},
+        {5, 512, 1, 64, 16, 300, 4000, 0.1f},  {6, 256, 64, 61, 17, 20, 4979, 0.5f}, {7, 256, 8, 72, 16, 300, 4900, 0.1f},
+        {8, 1024, 12, 64, 16, 300, 4700, 0.1f}, {3, 4096, 64, 60, 7, 2000, 4700, 0.1f}, {4, 512, 40, 41, 13, 2000, 2500, 0.1f},
+    };
+    for (size_t n = 0; n < sizeof cases / sizeof *cases; n++) {
+        locagen_steer_config config = STEERED;
+        config.mics = cases[n].mics, config.frame = cases[n].frame, config.smooth_bins = cases[n].smooth;
+        config.hop = config.frame / 2, config.taper = cases[n].taper;
+        config.azimuths = cases[n].azimuths, config.elevations = cases[n].elevations;
+        config.band_low_hz = cases[n].low, config.band_high_hz = cases[n].high;
+        steer_bench b = steer_set_up(config, chosen);
+        for (int learnt = 0; learnt < 2; learnt++)
+            for (int corner = 0; corner < 3; corner++) {
+                double azimuth = 2.1 * corner - 2.5, elevation = -0.35 - 0.35 * corner;
+                if (learnt)
+                    learn_hiss(&b, 20);
+                be_silent(&b);
+                add_wave(&b, azimuth, elevation, 0.1f);
+                add_hiss(&b, 0.1f);
+                CHECK(locagen_steer_listen(b.kernel, b.in, b.power) == 0, "finite");
+                locagen_steer_hear(b.kernel, 1.0f);
+                int found = locagen_steer_search(b.kernel, config.mics, b.sources);
+                CHECK(found >= 1 && found < config.mics, "case %zu: %d sources", n, found);
+                /* 10 dB and more: under a degree, a few where the band is narrow. */
+                double error = off_by(b.sources, azimuth, elevation);
+                CHECK(error < 3, "case %zu, learnt %d, corner %d: %.2f degrees", n, learnt, corner, error);
+                for (int source = 0; source < found; source++)
+                    CHECK(all_finite(&b.sources[source]), "case %zu, source %d", n, source);
+                CHECK(locagen_steer_map(b.kernel, b.map) == 0, "map");
+            }
+        float *bins = allocate(sizeof(float) * 2 * (size_t)(config.mics * b.bins));
+        float *noise = allocate(sizeof(float) * 2 * (size_t)(config.mics * config.mics * b.bins));
+        float *elevation = allocate(sizeof(float) * (size_t)config.elevations);
+        float *azimuth = allocate(sizeof(float) * (size_t)config.azimuths);
+        CHECK(locagen_steer_bins(b.kernel, bins) == 0, "bins");
+        CHECK(locagen_steer_noise(b.kernel, noise) == 0, "noise");
+        CHECK(locagen_steer_axes(b.kernel, elevation, azimuth) == 0, "axes");
+        CHECK(azimuth[0] == 0.0f && noise[0] > 0.0f, "azimuth %g, noise %g", (double)azimuth[0], (double)noise[0]);
+        free(bins), free(noise), free(elevation), free(azimuth);
+        steer_tear_down(&b);
+    }
+}
+
+static void test_steered_poles(const locagen_steer_paths *chosen)
+{
+    for (int mics = 2; mics <= 4; mics++)
+        for (int pole = 0; pole < 2; pole++) {
+            locagen_steer_config config = STEERED;
+            config.mics = mics, config.elevations = mics == 4 ? 14 : 7;
+            steer_bench b = steer_set_up(config, chosen);
+            be_silent(&b);
+            add_wave(&b, 0.3, pole ? -1.5707963267948966 : 0.0, 0.1f);
+            locagen_steer_listen(b.kernel, b.in, b.power);
+            locagen_steer_hear(b.kernel, 1.0f);
+            int found = locagen_steer_search(b.kernel, 1, b.sources);
+            CHECK(found == 1 && all_finite(b.sources), "%d mics, pole %d: %d", mics, pole, found);
+            double error = off_by(b.sources, 0.3, pole ? -1.5707963267948966 : 0.0);
+            CHECK(mics == 2 || error < 2, "%d mics, pole %d: %.2f degrees", mics, pole, error);
+            steer_tear_down(&b);
+        }
+}
+
+static void test_steered_faults(const locagen_steer_paths *chosen)
+{
+    static const float faults[] = {NAN, INFINITY, -INFINITY, 1e9f, 3e38f, 0.0f};
+    for (int mics = 2; mics <= 8; mics += 3)
+        for (size_t fault = 0; fault < sizeof faults / sizeof *faults; fault++) {
+            locagen_steer_config config = STEERED;
+            config.mics = mics, config.frame = 256;
+            steer_bench b = steer_set_up(config, chosen);
+            int faulty = (int)fault % mics;
+            for (int frame = 0; frame < 4; frame++) {
+                be_silent(&b);
+                add_hiss(&b, 0.1f);
+                add_wave(&b, 1.0, -0.6, frame == 3 ? 0.1f : 0.0f);
+                for (int n = 0; n < 256; n++)
+                    if (n == 99 || faults[fault] == 0.0f)
+                        b.in[faulty * 256 + n] = faults[fault];
+                int bad = locagen_steer_listen(b.kernel, b.in, b.power);
+                CHECK(bad == (faults[fault] == 0.0f ? 0 : 1 << faulty), "%d mics, fault %zu: %d", mics, fault, bad);
+                CHECK(b.power[faulty] == 0.0f, "power %g", (double)b.power[faulty]);
+                (frame < 3 ? locagen_steer_learn : locagen_steer_hear)(b.kernel, 0.5f);
+            }
+            int found = locagen_steer_search(b.kernel, 8, b.sources);
+            CHECK(found < mics && (found > 0) == (mics > 2), "%d mics, fault %zu: %d found", mics, fault, found);
+            for (int source = 0; source < found; source++)
+                CHECK(all_finite(&b.sources[source]), "%d mics, fault %zu", mics, fault);
+            CHECK(mics == 2 || off_by(b.sources, 1.0, -0.6) < 3, "%d mics, fault %zu: %.2f degrees", mics, fault,
+                  off_by(b.sources, 1.0, -0.6));
+            steer_tear_down(&b);
+        }
+}
+
+static void test_steered_silence(const locagen_steer_paths *chosen)
+{
+    steer_bench b = steer_set_up(STEERED, chosen);
+    CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 0, "nothing heard");
+    be_silent(&b);
+    for (int learnt = 0; learnt < 2; learnt++) {
+        CHECK(locagen_steer_listen(b.kernel, b.in, b.power) == 0, "silence is finite");
+        locagen_steer_hear(b.kernel, 1.0f);
+        CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 0, "silence, learnt %d", learnt);
+        CHECK(locagen_steer_map(b.kernel, b.map) == 0, "map");
+        int wrong = 0;
+        for (int n = 0; n < 60 * 7; n++)
+            wrong += b.map[n] != 0.0f;
+        CHECK(wrong == 0, "%d scores are not zero", wrong);
+        locagen_steer_learn(b.kernel, 0.5f);
+    }
+    add_wave(&b, 1.0, -0.6, 0.1f);
+    locagen_steer_listen(b.kernel, b.in, b.power);
+    locagen_steer_hear(b.kernel, 1.0f);
+    CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 1, "a source over silence");
+    CHECK(all_finite(b.sources) && off_by(b.sources, 1.0, -0.6) < 1, "%.2f degrees", off_by(b.sources, 1.0, -0.6));
+    locagen_steer_reset(b.kernel);
+    CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 0, "forgotten");
+    steer_tear_down(&b);
+}
+
+static void test_steered_paths_agree(void)
+{
+    steer_bench b = steer_set_up(STEERED, steer_paths[0]), c = steer_set_up(STEERED, steer_paths[path_count - 1]);
+    seed = 99;
+    learn_hiss(&b, 10);
+    seed = 99;
+    learn_hiss(&c, 10);
+    be_silent(&b);
+    add_wave(&b, 1.0, -0.6, 0.05f);
+    add_hiss(&b, 0.1f);
+    locagen_steer_listen(b.kernel, b.in, b.power), locagen_steer_listen(c.kernel, b.in, c.power);
+    locagen_steer_hear(b.kernel, 1.0f), locagen_steer_hear(c.kernel, 1.0f);
+    CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 1 && locagen_steer_search(c.kernel, 1, c.sources) == 1,
+          "one source");
+    /* Rounding through two inverses, of matrices from ten frames. */
+    float ratio = b.sources->score / c.sources->score;
+    CHECK(fabsf(ratio - 1) < 1e-3f, "scores' ratio %g", (double)ratio);
+    CHECK(off_by(b.sources, (double)c.sources->azimuth_rad, (double)c.sources->elevation_rad) < 0.05, "directions");
+    steer_tear_down(&b);
+    steer_tear_down(&c);
+}
+
+static void steer_refused(locagen_steer_config config, int expected, const char *what)
+{
+    char room[1] = {0};
+    CHECK(locagen_steer_sizeof(&config) == 0, "%s", what);
+    int code = locagen_steer_init((locagen_steer *)room, &config);
+    CHECK(code == expected, "%s: %d (%s)", what, code, locagen_strerror(code));
+}
+
+static void test_steered_refusals(void)
+{
+#define STEER_REFUSED(field, value, code)                                                                    \
+    do {                                                                                                     \
+        locagen_steer_config config = STEERED;                                                               \
+        config.field = value;                                                                                \
+        steer_refused(config, code, #field " = " #value);                                                    \
+    } while (0)
+    STEER_REFUSED(mics, 1, LOCAGEN_E_MICS);
+    STEER_REFUSED(mics, INT32_MAX, LOCAGEN_E_MICS);
+    STEER_REFUSED(frame, 1000, LOCAGEN_E_FRAME);
+    STEER_REFUSED(rate_hz, NAN, LOCAGEN_E_RATE);
+    STEER_REFUSED(band_high_hz, 5000.0f, LOCAGEN_E_BAND);
+    STEER_REFUSED(hop, 63, LOCAGEN_E_HOP);
+    STEER_REFUSED(hop, INT32_MAX, LOCAGEN_E_HOP);
+    STEER_REFUSED(hop, INT32_MIN, LOCAGEN_E_HOP);
+    STEER_REFUSED(taper, NAN, LOCAGEN_E_TAPER);
+    STEER_REFUSED(taper, 1.01f, LOCAGEN_E_TAPER);
+    STEER_REFUSED(smooth_bins, -1, LOCAGEN_E_SMOOTH);
+    STEER_REFUSED(smooth_bins, 65, LOCAGEN_E_SMOOTH);
+    STEER_REFUSED(loading, 0.0f, LOCAGEN_E_NOISE);
+    STEER_REFUSED(loading, INFINITY, LOCAGEN_E_NOISE);
+    STEER_REFUSED(floor, 0.0f, LOCAGEN_E_NOISE);
+    STEER_REFUSED(floor, NAN, LOCAGEN_E_NOISE);
+    STEER_REFUSED(speed_m_s, 0.0f, LOCAGEN_E_ARRAY);
+    STEER_REFUSED(speed_m_s, NAN, LOCAGEN_E_ARRAY);
+    STEER_REFUSED(positions_m[8], INFINITY, LOCAGEN_E_ARRAY);
+    STEER_REFUSED(positions_m[3], -10.1f, LOCAGEN_E_ARRAY);
+    STEER_REFUSED(azimuths, 7, LOCAGEN_E_GRID);
+    STEER_REFUSED(elevations, 181, LOCAGEN_E_GRID);
+    locagen_steer_config same_place = STEERED;
+    memset(same_place.positions_m, 0, sizeof same_place.positions_m);
+    steer_refused(same_place, LOCAGEN_E_ARRAY, "all in one place");
+    CHECK(locagen_steer_sizeof(NULL) == 0, "no configuration");
+    CHECK(locagen_steer_init(NULL, &STEERED) == LOCAGEN_E_NULL, "no memory");
+    steer_bench b = steer_set_up(STEERED, steer_paths[0]);
+    be_silent(&b);
+    CHECK(locagen_steer_init(b.kernel, NULL) == LOCAGEN_E_NULL, "no configuration");
+    CHECK(locagen_steer_reset(NULL) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_listen(NULL, b.in, b.power) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_listen(b.kernel, NULL, b.power) == LOCAGEN_E_NULL, "no input");
+    CHECK(locagen_steer_listen(b.kernel, b.in, NULL) == LOCAGEN_E_NULL, "no power");
+    CHECK(locagen_steer_learn(NULL, 0.5f) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_hear(NULL, 0.5f) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_learn(b.kernel, NAN) == LOCAGEN_E_SHARE, "no share");
+    CHECK(locagen_steer_hear(b.kernel, 1.5f) == LOCAGEN_E_SHARE, "too large a share");
+    CHECK(locagen_steer_search(NULL, 1, b.sources) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_search(b.kernel, 1, NULL) == LOCAGEN_E_NULL, "no output");
+    CHECK(locagen_steer_search(b.kernel, 0, b.sources) == LOCAGEN_E_COUNT, "no sources asked for");
+    CHECK(locagen_steer_map(b.kernel, NULL) == LOCAGEN_E_NULL, "no map");
+    CHECK(locagen_steer_bins(b.kernel, NULL) == LOCAGEN_E_NULL, "no bins");
+    CHECK(locagen_steer_noise(b.kernel, NULL) == LOCAGEN_E_NULL, "no noise");
+    CHECK(locagen_steer_axes(b.kernel, b.map, NULL) == LOCAGEN_E_NULL, "no axes");
+    CHECK(locagen_steer_bin_count(NULL) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_first_bin(NULL) == LOCAGEN_E_NULL, "no state");
+    steer_tear_down(&b);
 }
 
 int main(void)
 {
 #if defined(__x86_64__)
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-        paths[path_count++] = locagen_frame_avx2;
+        steer_paths[path_count] = &locagen_steer_avx2, paths[path_count++] = locagen_frame_avx2;
 #endif
     for (int n = 0; n < path_count; n++) {
         test_reference(paths[n]);
         test_sign(paths[n]);
         test_faulty_channels(paths[n]);
         test_silence(paths[n]);
+        test_steered_angles(steer_paths[n]);
+        test_steered_poles(steer_paths[n]);
+        test_steered_faults(steer_paths[n]);
+        test_steered_silence(steer_paths[n]);
     }
     test_paths_agree();
     test_refusals();
+    test_steered_paths_agree();
+    test_steered_refusals();
     printf("%d passed, %d failed (vector widths: %d)\n", passed, failed, path_count);
     return failed != 0;
 }

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
-from locagen_edge.errors import LocagenError
-from locagen_edge.mavlink.component import Component
+from locagen_edge.errors import LocagenError, SourceHungError
+from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.link import Link, parse
 from locagen_edge.models import default_directory, load_model, read_manifest
 from locagen_edge.pipeline import Pipeline
-from locagen_edge.settings import Settings
+from locagen_edge.settings import BearingSettings, Settings
 from locagen_edge.sources import open_source
-from locagen_edge.types import Estimate
 
 Finding = tuple[bool, str, str]
 """good, what, in words"""
+
+LEAST_S = 1.0
+"""A fault has to last for most of a second before it counts as one."""
+
+ALIVE = Status(hearing=True, track=None, snr_db=0.0, faults=())
 
 
 def check(settings: Settings, seconds: float) -> Iterator[Finding]:
@@ -28,18 +35,18 @@ def check(settings: Settings, seconds: float) -> Iterator[Finding]:
     yield from _models(settings)
     try:
         pipeline = Pipeline(settings)
+        yield True, "estimator", settings.bearing.estimator
     except LocagenError as error:
         yield False, "estimator", str(error)
-        return
-    yield True, "estimator", settings.bearing.estimator
-    yield from asyncio.run(_listen(settings, pipeline, seconds))
+        pipeline = Pipeline(
+            replace(settings, bearing=BearingSettings())
+        )  # the microphones can be judged still
+    yield from asyncio.run(_listen(settings, pipeline, max(seconds, LEAST_S)))
     yield asyncio.run(_link(settings, seconds))
 
 
 def _models(settings: Settings) -> Iterator[Finding]:
     """Every model of the manifest is loaded; one made for another array is fine as long as it is not used."""
-    from pathlib import Path
-
     directory = Path(settings.models.directory) if settings.models.directory else default_directory()
     try:
         names = sorted(read_manifest(directory))
@@ -58,33 +65,33 @@ def _models(settings: Settings) -> Iterator[Finding]:
 
 
 async def _listen(settings: Settings, pipeline: Pipeline, seconds: float) -> list[Finding]:
-    frames, overruns = 0, 0
-    last: Estimate | None = None
-    end = time.monotonic() + seconds
+    """What is wrong in any frame. Raises `SourceHungError`: after it only the end of the process helps."""
+    frames, overruns, level_dbfs = 0, 0, 0.0
+    faults: set[str] = set()
+    end = math.inf  # counted from the first frame: opening a device takes its time
     try:
         async with contextlib.aclosing(open_source(settings)) as source:
-            async with asyncio.timeout(seconds + settings.daemon.stall_s):
-                async for frame in source:
-                    last = pipeline.process(frame)
-                    frames += 1
-                    overruns += frame.overruns
-                    if time.monotonic() >= end:
-                        break
-    except TimeoutError:
-        return [(False, "microphones", f"no sound within {seconds + settings.daemon.stall_s:g} s")]
+            async for frame in source:
+                end = min(end, time.monotonic() + seconds)
+                estimate = pipeline.process(frame)
+                faults.update(estimate.faults)
+                level_dbfs = estimate.detection.level_dbfs
+                frames += 1
+                overruns += frame.overruns
+                if time.monotonic() >= end:
+                    break
+    except SourceHungError:
+        raise
     except LocagenError as error:
         return [(False, "microphones", str(error))]
-    if last is None:
-        return [(False, "microphones", f"{settings.audio.source}: the source ended before the first frame")]
-    found = [(False, "microphones", fault) for fault in last.faults]
+    found = [(False, "microphones", fault) for fault in sorted(faults)]
     if overruns:
         found.append((False, "microphones", f"sound was lost {overruns} times: is the machine overloaded?"))
-    level = last.detection.level_dbfs
-    return found or [(True, "microphones", f"{frames} frames, level {level:.0f} dBFS in the band")]
+    return found or [(True, "microphones", f"{frames} frames, level {level_dbfs:.0f} dBFS in the band")]
 
 
 async def _link(settings: Settings, seconds: float) -> Finding:
-    """Opens the link and waits for an autopilot's heartbeat."""
+    """Opens the link, says one heartbeat, and waits for an autopilot's."""
     component = Component(settings.mavlink)
     link = Link(
         parse(settings.mavlink.link),
@@ -93,16 +100,23 @@ async def _link(settings: Settings, seconds: float) -> Finding:
     )
     task = asyncio.create_task(link.run())
     try:
-        for _ in range(round(seconds / 0.05)):
+        told = False
+        for _ in range(max(round(seconds / 0.05), 10)):
             if component.autopilot_heard_s is not None:
                 break
+            if link.up and not told:
+                told = all(link.send(frame) for frame in component.due(time.monotonic(), ALIVE))
             await asyncio.sleep(0.05)
+        up = link.up
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+    name = settings.mavlink.link
     if component.autopilot_heard_s is not None:
-        return True, "link", f"{settings.mavlink.link}: an autopilot answers, system {component.system_id}"
-    if link.last_error:
-        return False, "link", link.last_error
-    # one-way links to a ground station are legal: say it, but it is no fault
-    return True, "link", f"{settings.mavlink.link}: open, but no autopilot has been heard in {seconds:g} s"
+        return True, "link", f"{name}: an autopilot answers, system {component.system_id}"
+    if up:  # one-way links to a ground station are legal, and it may start later: said, but no fault
+        nobody = "but nobody listens there yet" if link.refused else f"no autopilot heard in {seconds:g} s"
+        return True, "link", f"{name}: open, {nobody}"
+    if name.startswith("udpin:") and not link.last_error:
+        return True, "link", f"{name}: open, nobody has been heard in {seconds:g} s"
+    return False, "link", f"{name}: {link.last_error or f'not open after {seconds:g} s'}"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import io
 import json
 import logging
 import math
@@ -17,7 +18,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from locagen_edge import __version__
 from locagen_edge.errors import LocagenError, SettingsError, SourceHungError
@@ -27,13 +28,17 @@ from locagen_edge.types import Estimate
 
 if TYPE_CHECKING:
     from locagen_edge.daemon import Daemon
+    from locagen_edge.mavlink.link import Link
 
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `locagen-edge`."""
     arguments = _parser().parse_args(argv)
-    level = logging.DEBUG if arguments.verbose else logging.INFO
-    logging.basicConfig(level=level, format="%(levelname).1s %(message)s", stream=sys.stderr)
+    logging.basicConfig(level=logging.INFO, format="%(levelname).1s %(message)s", stream=sys.stderr)
+    if sys.stdout is None:  # started with it closed
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal without a degree sign is no reason to stop
     try:
         code = arguments.command(arguments)
     except SettingsError as error:
@@ -41,17 +46,26 @@ def main(argv: list[str] | None = None) -> None:
             print(f"locagen-edge: {line}", file=sys.stderr)
         code = 1
     except SourceHungError as error:
-        print(f"locagen-edge: {error}", file=sys.stderr, flush=True)
-        os._exit(1)  # an orderly exit would call into the driver that hangs
+        _leave(str(error))
     except LocagenError as error:
         print(f"locagen-edge: {error}", file=sys.stderr)
         code = 1
     except BrokenPipeError:  # `| head` has seen enough: not a failure, and nothing may be written any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+    except OSError as error:
+        print(f"locagen-edge: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
     except KeyboardInterrupt:
         code = 130
     sys.exit(code)
+
+
+def _leave(text: str) -> NoReturn:
+    """Ends at once. An orderly exit would wait for what hangs in a driver or in the pipeline."""
+    print(f"locagen-edge: {text}", file=sys.stderr, flush=True)
+    os._exit(1)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -61,9 +75,8 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit codes: 0 done, 1 a failure said in one line, 2 wrong usage.",
     )
     parser.add_argument("--version", action="version", version=f"locagen-edge {__version__}")
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("-v", "--verbose", action="store_true", help="say more on the error stream")
-    common.add_argument(
+    with_settings = argparse.ArgumentParser(add_help=False)
+    with_settings.add_argument(
         "--settings",
         type=Path,
         metavar="FILE",
@@ -71,10 +84,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def command(name: str, function: Callable[[argparse.Namespace], int], text: str, more: str) -> Any:
+    def command(
+        name: str, function: Callable[[argparse.Namespace], int], text: str, more: str, settings: bool = True
+    ) -> Any:
         sub = commands.add_parser(
             name,
-            parents=[common],
+            parents=[with_settings] if settings else [],
             help=text,
             description=f"{text[0].upper()}{text[1:]}. {more}",
         )
@@ -98,19 +113,27 @@ def _parser() -> argparse.ArgumentParser:
         "run a recording through the same pipeline, faster than real time",
         "One line per hop on standard output. t_s is the time of the frame's first sample; azimuth_deg is "
         "clockwise from ahead, 0 to 360; elevation_deg is positive up; sigma_deg is the azimuth's 1-sigma; "
-        "null means that nothing can be said. The estimate is given whether or not `call` is true.",
+        "null means that nothing can be said. The estimate is given whether or not `call` is true. A call "
+        "stands out of the background: a sound that is there from the first frame to the last is none.",
     )
     replay.add_argument("file", type=Path, metavar="FILE.wav", help="WAV or FLAC, any rate and channel count")
     replay.add_argument(
         "--format", choices=("jsonl", "table"), default="jsonl", help="JSON lines (default) or a table"
     )
 
-    command("devices", _devices, "list the capture devices", "The name is what audio.device looks for.")
+    command(
+        "devices",
+        _devices,
+        "list the capture devices",
+        "The name is what audio.device looks for.",
+        settings=False,
+    )
     check = command(
         "check",
         _check,
         "check settings, models, microphones and link, and say what to do",
-        "Listens to the source of the settings for some seconds. Exit code 1 where anything is wrong.",
+        "Listens to the source of the settings for some seconds, at least one. Exit code 1 where anything is "
+        "wrong.",
     )
     check.add_argument(
         "--seconds", type=_positive, default=2.0, metavar="N", help="how long to listen (default 2)"
@@ -119,9 +142,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text} is not a number above zero")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above zero")
     return value
 
 
@@ -160,12 +186,15 @@ async def _serve(settings: Settings, seconds: float | None, *, quiet: bool) -> N
             loop.call_later(seconds, daemon.stop)
         await daemon.main_loop()
     finally:
-        await daemon.shutdown()
+        clean = await daemon.shutdown()
+    if not clean:
+        _leave("the source or the pipeline hangs: left without waiting for it")
     if not quiet:
         c = daemon.counters
         print(
             f"{c.estimates} frames, {c.dropped} dropped, {c.overruns} overruns, "
-            f"{c.source_failures} source failures; sent {_counts(daemon.component.sent)}"
+            f"{c.source_failures} source failures; sent {_counts(daemon.component.sent)}, "
+            f"{daemon.link.dropped} of them lost"
         )
 
 
@@ -175,6 +204,7 @@ class LiveLine:
     def __init__(self) -> None:
         self._second = 0
         self._sent: Counter[str] = Counter()
+        self._dropped = self._refused = 0
 
     def __call__(self, daemon: Daemon) -> None:
         self._second += 1
@@ -188,8 +218,17 @@ class LiveLine:
             parts.append(describe(daemon.estimate))
             if latency:
                 parts.append(f"{1e3 * statistics.median(latency):.1f} ms")
-        parts.append(f"sent {_counts(news)}" if daemon.link.up else f"link down: {daemon.link.last_error}")
+        parts.append(self._link(daemon.link, news))
         print("  ".join(parts), flush=True)
+
+    def _link(self, link: Link, news: Counter[str]) -> str:
+        """What was sent in the last second, and what became of it."""
+        dropped, self._dropped = link.dropped - self._dropped, link.dropped
+        refused, self._refused = link.refused - self._refused, link.refused
+        if not link.up:
+            return f"link down: {link.last_error or 'nobody heard yet'}"
+        lost = f", {dropped} lost" if dropped else ""
+        return f"sent {_counts(news)}{lost}{' (nobody listens)' if refused else ''}"
 
 
 def describe(estimate: Estimate) -> str:

@@ -4,7 +4,11 @@
 
 Startup, main loop and shutdown are methods that a test can call. A source that fails is reopened with
 bounded back-off while the link goes on, and the link (which reopens itself) never holds up the sound. What
-is told (heartbeat, watchdog, status) follows from when the last frame was heard, never from hope.
+is told (heartbeat, values, watchdog) follows from when the last frame came out of the pipeline.
+
+The watchdog is fed while frames flow, and while a source that has said why it failed is being reopened: then
+another process would hear no more. It bites where frames stop without a word, the pipeline is stuck, or the
+event loop hangs.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import time
 from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -31,8 +36,11 @@ log = logging.getLogger(__name__)
 TICK_S = 0.1
 """How often what is due is sent: a tenth of the heartbeat's period."""
 FIRST_WAIT_S = 0.5
-DRAIN_S = 0.5
-"""How long shutdown waits for frames already in the queue; all of it has to end within a second."""
+STOP_S = 0.9
+"""All of shutdown has to end within a second: source, then queue, then the rest, with what is left of it."""
+CLOSE_S = 0.5
+DRAIN_S = 0.75
+"""of STOP_S: by when the source should be closed, and what was in the queue estimated"""
 
 
 @dataclass
@@ -72,9 +80,11 @@ class Daemon:
         self._sources = sources
         self._stopping = asyncio.Event()
         self._queue: asyncio.Queue[Frame | None] = asyncio.Queue()
-        self._heard_s = -float("inf")
+        self._heard_s = -math.inf
         self._tasks: list[asyncio.Task[None]] = []
         self._ready = False
+        self._working = False
+        self._told: BaseException | None = None
         self._link_was_up = False
 
     async def startup(self) -> None:
@@ -103,6 +113,7 @@ class Daemon:
         try:
             done, _ = await asyncio.wait([stopping, *self._tasks], return_when=asyncio.FIRST_COMPLETED)
             for task in done:
+                self._told = task.exception()
                 task.result()
         finally:
             stopping.cancel()
@@ -111,16 +122,27 @@ class Daemon:
         """Asks the main loop to end: safe to call from a signal handler of the loop."""
         self._stopping.set()
 
-    async def shutdown(self) -> None:
-        """Stops the source, drains the queue, closes the link. Ends within a second."""
+    async def shutdown(self) -> bool:
+        """Stops the source, drains the queue, closes the link, within a second.
+
+        False: something still hangs in a driver or in the pipeline, and only the end of the process ends it.
+        """
         notify(STOPPING="1", STATUS="stopping")
+        start = time.monotonic()
         tasks = {task.get_name(): task for task in self._tasks}
-        await _cancelled(tasks["capture"])
+        tasks["capture"].cancel()
+        await asyncio.wait([tasks["capture"]], timeout=CLOSE_S)
         self._queue.put_nowait(None)
-        await asyncio.wait([tasks["work"]], timeout=DRAIN_S)
+        await asyncio.wait([tasks["work"]], timeout=start + DRAIN_S - time.monotonic())
         self._send()
-        await _cancelled(*self._tasks)
+        for task in self._tasks:
+            task.cancel()
+        _, hanging = await asyncio.wait(self._tasks, timeout=start + STOP_S - time.monotonic())
+        for task in self._tasks:
+            if task.done() and not task.cancelled() and (error := task.exception()) is not self._told:
+                log.error("while stopping, %s: %s", task.get_name(), error)
         self._executor.shutdown(wait=False, cancel_futures=True)
+        return not hanging and not self._working
 
     # --- source -> queue
 
@@ -137,6 +159,7 @@ class Daemon:
                 if str(error) != self.source_fault:
                     log.error("%s", error)
                 self.source_fault = str(error)
+                self._tell_ready()
             else:  # a recording's end
                 self._queue.put_nowait(None)
                 await asyncio.Event().wait()
@@ -149,7 +172,6 @@ class Daemon:
         """Frames into the queue until the source ends. Raises `SourceError` where it fails or stalls."""
         async with contextlib.aclosing(self._sources(self.settings)) as source:
             async for frame in source:
-                self._heard_s = time.monotonic()
                 self.counters.frames += 1
                 self.counters.overruns += frame.overruns
                 if self.source_fault:
@@ -166,16 +188,24 @@ class Daemon:
         loop = asyncio.get_running_loop()
         frame_ns = round(self.settings.audio.frame / self.settings.audio.rate_hz * 1e9)
         while (frame := await self._queue.get()) is not None:
+            self._working = True
             self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame)
+            self._working = False
+            self._heard_s = time.monotonic()
             self.counters.estimates += 1
             self.counters.latency_s.append((time.monotonic_ns() - frame.t_ns - frame_ns) * 1e-9)
             self._send()
-            if not self._ready:
-                self._ready = notify(READY="1", STATUS="listening")
+            self._tell_ready()
+
+    def _tell_ready(self) -> None:
+        """Ready is who hears, or knows why not and will go on trying."""
+        if not self._ready:
+            self._ready = True
+            notify(READY="1", STATUS=self._in_words())
 
     @property
     def hearing(self) -> bool:
-        """Whether sound flows now: heartbeat and watchdog depend on it."""
+        """Whether sound flows through the pipeline now: heartbeat and bearings depend on it."""
         return time.monotonic() - self._heard_s < self.settings.daemon.stall_s
 
     def _send(self) -> None:
@@ -209,19 +239,15 @@ class Daemon:
             next_s = max(next_s, time.monotonic() - 1.0) + 1.0  # after a suspension no second is made up for
             if self._on_second is not None:
                 self._on_second(self)
-            if self.hearing:
+            if self.hearing or self.source_fault:
                 notify(WATCHDOG="1", STATUS=self._in_words())
             else:
-                notify(STATUS=f"no sound: {self.source_fault or 'waiting'}")
+                notify(STATUS=self._in_words())
             self.counters.latency_s.clear()
 
     def _in_words(self) -> str:
+        """The service manager's status line: state, and every loss since the start."""
         c = self.counters
-        return f"listening; {c.estimates} frames, {c.dropped} dropped, {c.overruns} overruns"
-
-
-async def _cancelled(*tasks: asyncio.Task[None]) -> None:
-    """Cancels tasks and waits until they have ended, whatever they end with."""
-    for task in tasks:
-        task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
+        state = "listening" if self.hearing else f"no sound: {self.source_fault or 'waiting'}"
+        losses = f"{c.dropped} dropped, {c.overruns} overruns, {self.link.dropped} messages lost"
+        return f"{state}; {c.estimates} frames, {losses}"

@@ -84,11 +84,6 @@ class MicArray:
         distance: F64 = np.linalg.norm(self.baselines_m, axis=1)
         return distance
 
-    @cached_property
-    def dimensions(self) -> int:
-        """1: all on a line, 2: in a plane, 3: in space (1 mm is the tolerance)."""
-        return int(np.linalg.matrix_rank(self.baselines_m, tol=1e-3))
-
     def longest_delay_s(self, speed_m_s: float) -> float:
         """The longest delay that any pair can see, seconds."""
         return float(self.spacing_m.max()) / speed_m_s
@@ -118,5 +113,6 @@ def tolerance_rad(array: MicArray, tolerance_m: float) -> float:
     tolerance / sqrt(sum_m (p_m . v)^2), v across the bearing; the worst v is the smallest eigenvalue's.
     """
     flat = array.positions_m[:, :2] - array.positions_m[:, :2].mean(axis=0)
-    spread = float(np.linalg.eigvalsh(flat.T @ flat)[0])
-    return tolerance_m / math.sqrt(spread) if spread > 1e-9 else math.pi
+    spread = np.linalg.eigvalsh(flat.T @ flat)
+    seen = spread[spread > 1e-6 * spread[-1]]  # microphones on one line are judged along it
+    return tolerance_m / math.sqrt(max(float(seen[0]), 1e-12))

@@ -4,6 +4,10 @@ cffi hands a pointer to C without asking what lies behind it (a float64 array pa
 silence), so everything is checked here, before the pointer. The C side is described in `csrc/locagen.h`.
 """
 
+import math
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -12,6 +16,7 @@ from locagen_edge.errors import KernelError
 
 _FLOAT32 = np.dtype(np.float32)
 _FLOATS = ffi.typeof("float[]")
+_MOST_MICS = 8
 
 
 class GccPhat:
@@ -79,9 +84,7 @@ class GccPhat:
         # With a size of 0, init refuses the configuration before it touches the one byte.
         self._memory = ffi.new("char[]", max(1, lib.locagen_gcc_sizeof(config)))
         self._state = ffi.cast("locagen_gcc *", self._memory)
-        code = lib.locagen_gcc_init(self._state, config)
-        if code < 0:
-            raise KernelError(ffi.string(lib.locagen_strerror(code)).decode())
+        _check(lib.locagen_gcc_init(self._state, config))
         self.pairs = tuple((i, j) for i in range(mics) for j in range(i + 1, mics))
         self.lag_s: npt.NDArray[np.float64] = np.arange(-lags, lags + 1) / (oversample * float(rate_hz))
         self._shape = (mics, frame)
@@ -109,14 +112,236 @@ class GccPhat:
         Raises:
             KernelError: `samples` has another type, shape or memory layout.
         """
-        try:
-            # Comparing types by identity first: the comparison by value takes longer than the rest.
-            if (samples.dtype is not _FLOAT32 and samples.dtype != _FLOAT32) or samples.shape != self._shape:
-                raise KernelError(
-                    f"samples: {samples.dtype} {samples.shape} given, float32 {self._shape} needed"
-                )
-            source = ffi.from_buffer(_FLOATS, samples)
-        except (AttributeError, TypeError, ValueError, BufferError) as fault:
-            raise KernelError(f"samples: a C-contiguous float32 array is needed: {fault}") from fault
+        source = _pointer(samples, self._shape)
         bad: int = self._process(self._state, source, self._correlation_pointer, self._power_pointer)
         return self._correlation.copy(), self._power.copy(), bad
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A direction that sound comes from, with what it is worth."""
+
+    azimuth_rad: float
+    """0 ahead, positive clockwise seen from above, -pi to pi"""
+    elevation_rad: float
+    """positive up; where the array is flat and level never above 0"""
+    score: float
+    """log of the likelihood ratio against "noise only"; noise alone gives some tens at 451 bins"""
+    snr: float
+    """power ratio per microphone, over the band's bins, as if the noise were white"""
+    information: tuple[float, float, float]
+    """xx, xy, yy in 1 / rad^2 along two arcs: x towards greater azimuth, y towards greater elevation"""
+
+    def sigma_rad(self) -> tuple[float, float]:
+        """1-sigma of azimuth and elevation, radians: pi where nothing is known.
+
+        The inverse of the information; azimuth is the arc over cos(elevation). Near the plane of a flat array
+        the elevation's is large: there delays do not change with it.
+        """
+        xx, xy, yy = self.information
+        half, apart = (xx + yy) / 2.0, math.hypot((xx - yy) / 2.0, xy)
+        # Each of the two principal directions is known to pi at worst.
+        values = [max(value, math.pi**-2) for value in (half + apart, half - apart)]
+        turn = 0.5 * math.atan2(2.0 * xy, xx - yy)
+        c, s = math.cos(turn) ** 2, math.sin(turn) ** 2
+        arc = math.sqrt(c / values[0] + s / values[1])
+        level = max(math.cos(self.elevation_rad), 1e-6)
+        return min(math.pi, arc / level), min(math.pi, math.sqrt(s / values[0] + c / values[1]))
+
+
+class Steered:
+    """Maximum likelihood over directions, with the noise's own cross-spectra.
+
+    For each frame: `listen`, then `learn` (while nothing calls) or `hear`, then `search`. Score and sources:
+    `csrc/locagen.h`.
+
+    Args:
+        positions_m: microphones, shape `(mics, 3)`, FRD, metres; 2 to 8 of them.
+        frame: samples per microphone and frame, a power of two from 256 to 4096.
+        hop: samples from frame to frame, at least `frame / 8`; 0: frames do not overlap.
+        rate_hz: sample rate.
+        speed_m_s: of sound.
+        band_hz: lowest and highest frequency that count, both included.
+        taper: share of the window that is tapered, 0 rectangle, 1 Hann. The default, 0.1, loses 3 % of
+            accuracy to tapering, Hann 39 %; Hann keeps strong tones of the noise out of other bins.
+        smooth_bins: bins each side over which the source's spectrum is taken for smooth.
+        loading: added to the noise's diagonal, as a share of its mean: the deepest null is this deep.
+        floor: the same as power of one bin, mean square of full scale.
+        azimuths, elevations: the coarse grid; None: fine enough for the array.
+
+    Raises:
+        KernelError: the configuration is none that the kernel can do; the text names the fault.
+
+    Attributes:
+        first_bin: number of the band's first bin.
+        frequency_hz: of each bin in the band, float64, shape `(bins,)`.
+        elevation_rad, azimuth_rad: axes of the map, float32.
+
+    One object serves one thread.
+    """
+
+    def __init__(
+        self,
+        positions_m: npt.ArrayLike,
+        *,
+        frame: int,
+        hop: int = 0,
+        rate_hz: float,
+        speed_m_s: float,
+        band_hz: tuple[float, float] = (300.0, 4700.0),
+        taper: float = 0.1,
+        smooth_bins: int = 6,
+        loading: float = 1e-3,
+        floor: float = 1e-12,
+        azimuths: int | None = None,
+        elevations: int | None = None,
+    ) -> None:
+        positions = np.array(positions_m, np.float64)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise KernelError(f"array: positions of shape (mics, 3) are needed, {positions.shape} given")
+        mics = len(positions)
+        if mics > _MOST_MICS:
+            raise KernelError(ffi.string(lib.locagen_strerror(lib.LOCAGEN_E_MICS)).decode())
+        rows, columns = _grid(positions, band_hz[1] / speed_m_s if speed_m_s > 0 else 0.0)
+        try:
+            config = ffi.new(
+                "locagen_steer_config *",
+                {
+                    "mics": mics,
+                    "frame": frame,
+                    "hop": hop,
+                    "smooth_bins": smooth_bins,
+                    "azimuths": columns if azimuths is None else azimuths,
+                    "elevations": rows if elevations is None else elevations,
+                    "rate_hz": rate_hz,
+                    "band_low_hz": band_hz[0],
+                    "band_high_hz": band_hz[1],
+                    "taper": taper,
+                    "loading": loading,
+                    "floor": floor,
+                    "speed_m_s": speed_m_s,
+                    "positions_m": positions.ravel().tolist(),
+                },
+            )
+        except (OverflowError, TypeError) as fault:
+            raise KernelError(f"kernel configuration: {fault}") from fault
+        self._memory = ffi.new("char[]", max(1, lib.locagen_steer_sizeof(config)))
+        self._state = ffi.cast("locagen_steer *", self._memory)
+        _check(lib.locagen_steer_init(self._state, config))
+        self._shape = (mics, frame)
+        self._grid = (config.elevations, config.azimuths)
+        self._power = np.empty(mics, _FLOAT32)
+        self._power_pointer = ffi.from_buffer(_FLOATS, self._power)
+        self._sources = ffi.new("locagen_source[]", _MOST_MICS)
+        self._listen = lib.locagen_steer_listen
+        bins = lib.locagen_steer_bin_count(self._state)
+        self.first_bin: int = lib.locagen_steer_first_bin(self._state)
+        self.frequency_hz: npt.NDArray[np.float64] = (
+            (self.first_bin + np.arange(bins)) * float(rate_hz) / frame
+        )
+        self.elevation_rad = np.empty(self._grid[0], _FLOAT32)
+        self.azimuth_rad = np.empty(self._grid[1], _FLOAT32)
+        _check(
+            lib.locagen_steer_axes(
+                self._state,
+                ffi.from_buffer(_FLOATS, self.elevation_rad),
+                ffi.from_buffer(_FLOATS, self.azimuth_rad),
+            )
+        )
+
+    def listen(self, samples: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], int]:
+        """Takes a frame in: window, FFT.
+
+        Args:
+            samples: float32, C-contiguous, shape `(mics, frame)`, full scale 1.0; left as it is.
+
+        Returns:
+            The mean square of each microphone in the band, float32, shape `(mics,)`, new with every call; and
+            a mask with bit `m` set where microphone `m` held a sample that is not finite or far too large: it
+            does not count in this frame. A dead one, 50 dB under the loudest, does not either.
+
+        Raises:
+            KernelError: `samples` has another type, shape or memory layout.
+        """
+        bad: int = self._listen(self._state, _pointer(samples, self._shape), self._power_pointer)
+        return self._power.copy(), bad
+
+    def learn(self, share: float) -> None:
+        """Puts the frame into the noise's matrix: R <- (1 - share) R + share x x^H, share 0 to 1."""
+        _check(lib.locagen_steer_learn(self._state, share))
+
+    def hear(self, share: float = 1.0) -> None:
+        """The same for the signal's matrix; 1: this frame alone."""
+        _check(lib.locagen_steer_hear(self._state, share))
+
+    def search(self, max_sources: int = 1) -> tuple[Source, ...]:
+        """The sources in the signal's matrix, strongest first; at most one less than there are microphones.
+
+        None before `hear`, in silence and with less than two microphones. Where nothing was learnt the noise
+        is taken for white, and its level from what is across the best direction.
+        """
+        room = min(max_sources, _MOST_MICS)
+        found = _check(lib.locagen_steer_search(self._state, room, self._sources))
+        return tuple(
+            Source(s.azimuth_rad, s.elevation_rad, s.score, s.snr, tuple(s.information))
+            for s in self._sources[0:found]
+        )
+
+    def map(self) -> npt.NDArray[np.float32]:
+        """Scores on the coarse grid, float32, shape `(elevations, azimuths)`.
+
+        Its axes are `elevation_rad` and `azimuth_rad`.
+        """
+        scores = np.empty(self._grid, _FLOAT32)
+        _check(lib.locagen_steer_map(self._state, ffi.from_buffer(_FLOATS, scores)))
+        return scores
+
+    def bins(self) -> npt.NDArray[np.complex64]:
+        """Bins of the last frame, complex64, shape `(mics, bins)`; squared magnitudes are bin powers."""
+        bins = np.empty((self._shape[0], len(self.frequency_hz)), np.complex64)
+        _check(lib.locagen_steer_bins(self._state, ffi.from_buffer(_FLOATS, bins.view(_FLOAT32))))
+        return bins
+
+    def noise(self) -> npt.NDArray[np.complex64]:
+        """The noise's matrix, complex64, shape `(bins, mics, mics)`, without loading; zeros where none is."""
+        mics = self._shape[0]
+        noise = np.empty((len(self.frequency_hz), mics, mics), np.complex64)
+        _check(lib.locagen_steer_noise(self._state, ffi.from_buffer(_FLOATS, noise.view(_FLOAT32))))
+        return noise
+
+    def reset(self) -> None:
+        """Forgets noise, signal and frame."""
+        _check(lib.locagen_steer_reset(self._state))
+
+
+def _check(code: int) -> int:
+    if code < 0:
+        raise KernelError(ffi.string(lib.locagen_strerror(code)).decode())
+    return code
+
+
+def _grid(positions_m: npt.NDArray[np.float64], waves_per_m: float) -> tuple[int, int]:
+    """Rows and columns of a grid on which the phase across the array steps by about a radian.
+
+    A step of elevation over the rim of a flat array changes little, and so do azimuths near the pole: the
+    rectangle is as fine as needed where it is coarsest.
+    """
+    arms = positions_m[:, None] - positions_m[None]
+    reach = 2.0 * math.pi * waves_per_m * float(np.linalg.norm(arms, axis=2).max(initial=0.0))
+    if not math.isfinite(reach):
+        return 2, 8  # the kernel refuses the positions by name
+    flat = np.linalg.matrix_rank(positions_m - positions_m.mean(axis=0), tol=1e-3) < 3
+    columns = min(720, max(16, math.ceil(2.0 * math.pi * reach / 8.0) * 8))
+    rows = max(4, math.ceil(0.5 * math.pi * reach / 2.0))
+    return min(180, rows if flat else 2 * rows), columns
+
+
+def _pointer(samples: npt.NDArray[np.float32], shape: tuple[int, int]) -> Any:
+    """What C may read from: everything is checked before."""
+    try:
+        # Comparing types by identity first: the comparison by value takes longer than the rest.
+        if (samples.dtype is not _FLOAT32 and samples.dtype != _FLOAT32) or samples.shape != shape:
+            raise KernelError(f"samples: {samples.dtype} {samples.shape} given, float32 {shape} needed")
+        return ffi.from_buffer(_FLOATS, samples)
+    except (AttributeError, TypeError, ValueError, BufferError) as fault:
+        raise KernelError(f"samples: a C-contiguous float32 array is needed: {fault}") from fault

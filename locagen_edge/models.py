@@ -55,6 +55,8 @@ def load_model(name: str, settings: Settings) -> Model:
             f"model {name}: is not in {directory / MANIFEST}; there are {', '.join(sorted(entries))}"
         )
     entry = entries[name]
+    if not isinstance(entry, dict):
+        raise ModelError(f"model {name}: its entry in {directory / MANIFEST} is not a table")
     try:
         content = (directory / entry["file"]).read_bytes()
         _check_hash(name, content, entry["sha256"])

@@ -183,14 +183,14 @@ class CorrelationSettings:
         (300.0, 4700.0), "Lowest and highest frequency used.", unit="Hz", least=1, most=48000
     )
     oversample: int = setting(
-        16, "Grid points per sample of lag; a parabola refines further.", unit="points", least=1, most=64
+        16, "Grid points per sample of lag; a parabola refines further.", unit="points", least=4, most=64
     )
     floor_dbfs: float = setting(
         -120.0,
         "Power of one frequency bin below which it fades out: silence gives zeros, not noise.",
         unit="dBFS",
         least=-200,
-        most=0,
+        most=-1,
     )
     relative_floor_db: float = setting(
         -20.0,
@@ -225,7 +225,11 @@ class DetectionSettings:
         6.0, "Largest misfit of the delays with one far source.", unit="sigma", least=1, most=1000
     )
     background_s: float = setting(
-        6.0, "How slowly the background rises to a lasting new level.", unit="s", least=0.1, most=600
+        6.0,
+        "Time whose quietest moment is the background: a level that lasts longer, rotors or a call, is it.",
+        unit="s",
+        least=0.5,
+        most=600,
     )
 
 
@@ -290,8 +294,9 @@ class DaemonSettings:
     )  # fmt: skip
     stall_s: float = setting(
         2.0,
-        "Without a frame for this long the source counts as lost: it is reopened, and no heartbeat is sent.",
-        unit="s", least=0.2, most=60,
+        "Without a frame for this long the source counts as lost: it is reopened, and no heartbeat is sent. "
+        "At least two hops.",
+        unit="s", least=0.2, most=10,
     )  # fmt: skip
     backoff_s: float = setting(
         10.0, "Longest wait between two attempts to reopen a source or a link.", unit="s", least=0.1, most=600
@@ -360,7 +365,7 @@ def _faults_of_value(value: Any, meta: Any) -> Iterator[str]:
             yield f"{value!r} is not of the form that the manual gives: {meta['text']}"
     elif not isinstance(value, bool):
         unit = f" {meta['unit']}" if meta["unit"] else ""
-        if not math.isfinite(value):
+        if isinstance(value, float) and not math.isfinite(value):
             yield f"{value} is not a finite number"
         elif not meta["least"] <= value <= meta["most"]:
             yield f"{value}{unit} is outside {meta['least']:g} to {meta['most']:g}{unit}"
@@ -368,6 +373,9 @@ def _faults_of_value(value: Any, meta: Any) -> Iterator[str]:
 
 def _faults_between_fields(s: Settings) -> Iterator[str]:
     yield from _faults_of_array(s)
+    yield from _faults_of_link(s)
+    if s.audio.rate_hz > 0 and s.daemon.stall_s < 2 * s.hop_s:
+        yield f"daemon.stall_s: {s.daemon.stall_s:g} s is less than two hops ({2 * s.hop_s:.3g} s)"
     if s.audio.frame & (s.audio.frame - 1):
         yield f"audio.frame: {s.audio.frame} is not a power of two"
     if s.audio.hop > s.audio.frame:
@@ -389,7 +397,7 @@ def _faults_between_fields(s: Settings) -> Iterator[str]:
     band = s.correlation.band_hz
     if len(band) != 2 or not band[0] < band[1]:
         yield f"correlation.band_hz: {list(band)} is not a lowest and a highest frequency"
-    elif band[1] >= s.audio.rate_hz / 2:
+    elif np.float32(band[1]) >= s.audio.rate_hz / 2:  # the kernel's precision
         yield f"correlation.band_hz: {band[1]:g} Hz is not below half of audio.rate_hz ({s.audio.rate_hz} Hz)"
     elif (band[1] - band[0]) * s.audio.frame / s.audio.rate_hz < 8:
         bin_hz = s.audio.rate_hz / s.audio.frame
@@ -413,14 +421,25 @@ def _faults_of_array(s: Settings) -> Iterator[str]:
             yield f"{key}: microphones {i} and {j} are at the same place"
     if s.environment.temperature_c > -KELVIN:
         longest = array.longest_delay_s(s.speed_m_s) * s.audio.rate_hz
-        if longest + 1 >= s.audio.frame / 4:
+        if longest + 2 >= s.audio.frame / 4:  # room for the margin and the parabola's neighbour
             yield f"{key}: a longest delay of {longest:.0f} samples is too much for frames of {s.audio.frame}"
-    needs_plane = s.bearing.estimator in ("far-field", "hyperbolic")
-    if needs_plane and np.linalg.matrix_rank(array.baselines_m[:, :2], tol=1e-3) < 2:
+    flat = array.baselines_m[:, :2]
+    if s.bearing.estimator == "two-mic":
+        if np.hypot(*flat[0]) < 1e-3:
+            yield f"{key}: the first two stand one above the other: they see no azimuth"
+    elif np.linalg.matrix_rank(flat, tol=1e-3) < 2:
         yield (
             f"{key}: seen from above the microphones are on one line, "
             f"and bearing.estimator = {s.bearing.estimator!r} needs a plane"
         )
+
+
+def _faults_of_link(s: Settings) -> Iterator[str]:
+    scheme, _, rest = s.mavlink.link.partition(":")
+    digits = rest.rpartition(":")[2]
+    what, most = ("baud rate", 10_000_000) if scheme == "serial" else ("port", 65535)
+    if digits.isdigit() and not 1 <= int(digits) <= most:
+        yield f"mavlink.link: {what} {digits} is not a number from 1 to {most}"
 
 
 S = typing.TypeVar("S", bound=Settings)
@@ -488,7 +507,10 @@ def _convert(value: Any, kind: Any) -> Any:
         item = typing.get_args(kind)[0]
         return tuple(_convert(v, item) for v in value)
     if kind is float and type(value) in (int, float):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:  # a whole number of 400 digits
+            return math.inf if value > 0 else -math.inf
     if type(value) is not kind:
         raise TypeError
     return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import os
@@ -71,6 +72,7 @@ def test_help_is_there(command):
     [
         [],
         ["fly"],
+        ["devices", "--settings", "x.toml"],
         ["replay"],
         ["run", "--seconds", "0"],
         ["run", "--seconds", "x"],
@@ -196,6 +198,35 @@ def test_a_recording_that_is_cut_short_is_used_as_far_as_it_goes(recording, tmp_
     assert 15 < len(done.stdout.splitlines()) < 20
 
 
+# --- output that cannot be written
+
+
+def shell(command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["bash", "-c", command.replace("locagen-edge", f"{sys.executable} -m locagen_edge")],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        timeout=60,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("arguments", ["replay {}", "run --seconds 1.5"])
+def test_a_full_disk_is_one_line(recording, arguments):
+    done = shell(f"locagen-edge {arguments.format(recording)} > /dev/full")
+    assert done.returncode == 1
+    assert "locagen-edge: output: No space left on device" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_closed_output_and_poor_terminals_are_borne(recording):
+    assert shell(f"locagen-edge replay {recording} >&-").returncode == 0
+    done = shell("PYTHONIOENCODING=ascii locagen-edge run --seconds 1.5")
+    assert done.returncode == 0, done.stderr
+    assert "bearing" in done.stdout
+
+
 # --- settings
 
 
@@ -247,6 +278,44 @@ def test_check_says_what_is_wrong_and_exits_with_1(tmp_path):
     assert any("link:" in line and "ttyNONE" in done.stdout for line in wrong), done.stdout
 
 
+def test_check_hears_a_fault_however_short_the_time(tmp_path):
+    path = tmp_path / "dead.wav"
+    samples = heard(Settings(), 1.0, -0.3, 20.0, 40_000)
+    samples[1] = 0.0
+    soundfile.write(path, samples.T, 10_000)
+    settings = tmp_path / "s.toml"
+    settings.write_text(f'[audio]\nsource = "wav"\nfile = "{path}"\n')
+    done = cli("check", "--seconds", "0.1", "--settings", settings)
+    assert "WRONG  microphones: microphone 1: dead" in done.stdout
+    assert done.returncode == 1
+
+
+def test_check_goes_on_after_an_unfit_model(tmp_path):
+    settings = tmp_path / "s.toml"
+    settings.write_text('[bearing]\nestimator = "model:absent"\n')
+    done = cli("check", "--seconds", "0.5", "--settings", settings)
+    assert done.returncode == 1
+    assert "WRONG  estimator: model absent" in done.stdout
+    assert "ok     microphones" in done.stdout
+    assert "link" in done.stdout
+
+
+def test_check_knows_a_link_that_never_opened(tmp_path):
+    """A listener whose queue is full answers nothing."""
+    with socket.socket() as listener, contextlib.ExitStack() as stack:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(0)
+        for _ in range(3):
+            waiting = stack.enter_context(socket.socket())
+            waiting.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                waiting.connect(listener.getsockname())
+        settings = tmp_path / "s.toml"
+        settings.write_text(f'[mavlink]\nlink = "tcp:127.0.0.1:{listener.getsockname()[1]}"\n')
+        done = cli("check", "--seconds", "1", "--settings", settings)
+    assert "WRONG  link: " in done.stdout, done.stdout
+
+
 # --- devices
 
 
@@ -262,8 +331,8 @@ def test_devices_lists_or_says_why_not():
 @pytest.mark.parametrize(
     ("link", "says"),
     [
-        ("udpout:127.0.0.1:99999", "port '99999' is not a number from 1 to 65535"),
-        ("tcp:127.0.0.1:0", "port '0'"),
+        ("udpout:127.0.0.1:99999", "mavlink.link: port 99999 is not a number"),
+        ("tcp:127.0.0.1:0", "mavlink.link: port 0 is not"),
     ],
 )
 def test_a_port_that_cannot_be_is_refused_in_one_line(tmp_path, link, says):

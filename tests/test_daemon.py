@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import importlib.util
 import math
 import os
@@ -10,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
@@ -313,11 +315,68 @@ def test_ready_comes_with_the_first_sound_and_the_watchdog_only_with_sound(monke
                 gate.clear()
                 await until(lambda: not daemon.hearing)
                 listen()
-                before = said.count(b"WATCHDOG=1\n")
+                said.clear()
                 await asyncio.sleep(1.3)
-                assert said.count(b"WATCHDOG=1\n") == before
                 assert b"STATUS=no sound" in listen()
+                assert not any(message.startswith(b"WATCHDOG=1") for message in said)
             assert b"STOPPING=1" in listen()
+
+        asyncio.run(test())
+
+
+def test_a_source_that_says_why_it_failed_keeps_the_service_up(monkeypatch, tmp_path):
+    """Ready, and fed: another process would find the same cable out. The heartbeat stays away."""
+    settings = with_link(9, daemon={"stall_s": 0.2, "backoff_s": 0.5})
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+
+        async def absent(_: Settings) -> AsyncGenerator[Frame, None]:
+            raise SourceError("no such device")
+            yield
+
+        async def test() -> None:
+            async with running(settings, sources=absent) as daemon:
+                await asyncio.sleep(2.3)
+                assert daemon.component.sent["HEARTBEAT"] == 0
+
+        asyncio.run(test())
+        said = b""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                said += manager.recv(300) + b"\n"
+    assert b"READY=1" in said
+    assert b"WATCHDOG=1" in said
+    assert b"STATUS=no sound: no such device" in said
+
+
+def test_a_stuck_pipeline_is_not_taken_for_health(monkeypatch, tmp_path):
+    """Frames come in, nothing comes out: no heartbeat, no bearings, no watchdog, and an end all the same."""
+    settings = with_link(9, daemon={"stall_s": 0.3})
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+
+        async def test() -> None:
+            daemon = Daemon(settings, sources=source(settings))
+            await daemon.startup()
+            await until(lambda: daemon.counters.estimates > 3)
+            release = threading.Event()
+            daemon.pipeline.process = lambda _: release.wait(WITHIN_S)
+            await until(lambda: not daemon.hearing)
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    manager.recv(300)
+            sent = sum(daemon.component.sent.values())
+            frames = daemon.counters.frames
+            await asyncio.sleep(1.3)
+            assert daemon.counters.frames > frames
+            assert sum(daemon.component.sent.values()) == sent
+            assert not manager.recv(300).startswith(b"WATCHDOG")
+            assert await daemon.shutdown() is False
+            release.set()
 
         asyncio.run(test())
 

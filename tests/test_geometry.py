@@ -67,7 +67,6 @@ def test_triangle_has_its_sides_and_order():
     array = equilateral(0.10)
     np.testing.assert_allclose(array.spacing_m, 0.10)
     assert array.pairs == ((0, 1), (0, 2), (1, 2))
-    assert array.dimensions == 2
     assert array.longest_delay_s(343.0) * 10_000 == pytest.approx(2.915, abs=1e-3)
 
 

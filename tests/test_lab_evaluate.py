@@ -82,6 +82,9 @@ def test_a_field_like_the_twin_is_told_to_be_one(field, tmp_path, capsys) -> Non
     assert all(row["error_m"] is None or abs(row["error_m"]) < 0.3 for row in near)
     far = [row for row in result["labels"] if row["file"] == "far.wav"]
     assert not any(row["range_observable"] for row in far)
+    assert told["range_compared"] == sum(row["error_m"] is not None for row in near) > 0
+    assert told["range_mean_m"] < 0.2
+    assert told["twin_range_share"] < 0.5
     text = (tmp_path / "out" / "report.md").read_text()
     assert "nan" not in text
     assert text.count("| labels.csv:") == len(result["labels"])

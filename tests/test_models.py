@@ -100,10 +100,12 @@ def test_an_unknown_name_is_refused_with_the_known_ones(folder):
     refused(folder, f"model nope: is not in .*there are {NAME}", name="nope")
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"models": []}'])
+@pytest.mark.parametrize(
+    "content", ["{", "[]", '{"models": []}', '{"models": {"tdoa-mlp": []}}', '{"models": {"tdoa-mlp": null}}']
+)
 def test_a_broken_manifest_is_refused(folder, content):
     (folder / "manifest.json").write_text(content)
-    refused(folder, "manifest|names")
+    refused(folder, "manifest")
 
 
 def test_a_missing_manifest_is_refused(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -22,7 +23,7 @@ from scenes import (
 )
 
 from locagen_edge.cli import replay
-from locagen_edge.errors import SourceError
+from locagen_edge.errors import SettingsError, SourceError
 from locagen_edge.geometry import wrap
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings, from_table
@@ -129,6 +130,78 @@ def test_a_frame_of_another_shape_or_rate_is_refused():
         pipeline.process(replace(frame, rate_hz=48000.0))
 
 
+# --- the corners of the settings
+
+RING = [[0.05 * math.cos(a), 0.05 * math.sin(a), 0.0] for a in np.linspace(0, 2 * math.pi, 8, endpoint=False)]
+
+
+@pytest.mark.parametrize("mics", range(2, 9))
+@pytest.mark.parametrize("name", ["far-field", "hyperbolic", "two-mic"])
+def test_any_number_of_microphones_bears_and_tracks(mics, name):
+    table = {
+        "array": {"positions_m": RING[:mics], "tolerance_m": 0.0005},
+        "audio": {"channel_map": list(range(mics))},
+        "bearing": {"estimator": name},
+        "detection": {"snr_db": -20},
+    }
+    if mics == 2 and name != "two-mic":
+        with pytest.raises(SettingsError, match="needs a plane"):
+            from_table(table)
+        return
+    settings = from_table(table)
+    azimuth = math.radians(110)  # on the side that the first pair looks to
+    quiet = 1e-4 * np.random.default_rng(0).standard_normal((mics, 5120)).astype(np.float32)
+    sound = np.concatenate([quiet, heard(settings, azimuth, 0.0, 20.0, 30_000)], axis=1)
+    track = process(settings, sound)[-1].track
+    assert track is not None
+    assert track.azimuth_sigma_rad < math.radians(6.0)
+    assert abs(wrap(track.azimuth_rad - azimuth)) < 4.0 * track.azimuth_sigma_rad
+    assert track.confidence > 0.8
+
+
+CORNERS = [
+    {"correlation": {"oversample": 4}},
+    {"correlation": {"oversample": 64}},
+    {"correlation": {"band_hz": [300, 700]}},
+    {"correlation": {"band_hz": [1, 4999]}},
+    {"correlation": {"floor_dbfs": -200, "relative_floor_db": -120}},
+    {"correlation": {"relative_floor_db": -1}},
+    {"audio": {"frame": 256, "hop": 32}},
+    {"audio": {"frame": 4096, "hop": 4096}},
+    {"audio": {"rate_hz": 96000}},
+    {"environment": {"temperature_c": -60}},
+    {"environment": {"temperature_c": 60}},
+    {"array": {"tolerance_m": 0}},
+    {"array": {"tolerance_m": 0.1}},
+    {"array": {"positions_m": [[0, 0, 0], [2e-3, 0, 0], [0, 2e-3, 0]]}},
+    {"array": {"positions_m": [[0, 0, 0], [8, 0, 0], [0, 8, 0]]}, "audio": {"frame": 4096}},
+    {"array": {"positions_m": [[5, 5, 5], [5.1, 5, 5.001], [5, 5.1, 4.999]]}},
+]
+
+
+@pytest.mark.parametrize("table", CORNERS, ids=str)
+def test_the_corners_of_the_settings_give_covered_bearings(table):
+    settings = from_table(table)
+    frame = settings.audio.frame
+    scores = []
+    for trial in range(12):
+        azimuth = 0.5 * trial
+        estimate = process(settings, heard(settings, azimuth, -0.4, 15.0, frame, seed=trial))[0]
+        if estimate.bearing.azimuth_rad is not None:
+            error = abs(wrap(estimate.bearing.azimuth_rad - azimuth))
+            scores.append(error / estimate.bearing.azimuth_sigma_rad)
+    assert np.mean(np.array(scores) < 3.0) > 0.9 if scores else True
+
+
+def test_noise_alone_rarely_has_a_bearing_and_never_a_sure_one():
+    settings = from_table(EXACT)
+    rng = np.random.default_rng(8)
+    noise = 0.01 * rng.standard_normal((3, 200 * 512 + 512)).astype(np.float32)
+    bearings = [estimate.bearing for estimate in process(settings, noise)]
+    given = [b for b in bearings if b.azimuth_rad is not None]
+    assert len(given) < 0.02 * len(bearings)
+
+
 # --- bad input
 
 
@@ -211,7 +284,7 @@ FAULTY = {
     "all silent": (lambda x: x.fill(0.0), "no microphone hears anything"),
     "not numbers": (lambda x: x[2].__setitem__(slice(None, None, 100), np.nan), "microphone 2: samples"),
     "clipped": (lambda x: x.__setitem__(0, np.clip(100 * x[0], -1, 1)), "microphone 0: clipped"),
-    "offset": (lambda x: x.__setitem__(0, x[0] + 0.3), "microphone 0: a constant offset"),
+    "offset": (lambda x: x.__setitem__(0, x[0] + 0.15), "microphone 0: a constant offset"),
     "duplicated": (lambda x: x.__setitem__(2, x[1]), "microphones 1 and 2: the same signal"),
 }
 
@@ -274,6 +347,33 @@ def test_a_call_is_found_and_its_pause_too():
     track = next(e for e in estimates if e.t_ns * 1e-9 > 4.8).track
     assert abs(math.degrees(wrap(track.azimuth_rad - 1.0))) < 1.0
     assert track.confidence > 0.9
+
+
+def test_rotors_that_start_are_a_call_for_no_longer_than_the_background_is_learnt():
+    """30 dB more noise than before: something is heard, but after background_s it is known for what it is."""
+    settings = Settings()
+    rate = settings.audio.rate_hz
+    rng = np.random.default_rng(6)
+    noise = 0.001 * rng.standard_normal((3, 20 * rate))
+    rotors = np.zeros_like(noise)
+    for hub in hubs_m(4, 0.3):
+        sound = np.concatenate(list(itertools.islice(rotor(0.5, rate, 4800.0, rng), 20 * rate // 1024)))
+        heard_at = place(sound[: 20 * rate], rate, settings.mic_array.positions_m, hub, settings.speed_m_s)
+        rotors[:, : heard_at.shape[1]] += heard_at
+    rotors *= 0.03 / np.sqrt(np.mean(rotors**2))
+    rotors[:, : 5 * rate] = 0.0
+    estimates = process(settings, (noise + rotors).astype(np.float32))
+    late = [e for e in estimates if e.t_ns * 1e-9 > 5.0 + settings.detection.background_s + 1.0]
+    assert len(late) > 100
+    assert not any(e.detection.call for e in late)
+
+
+def test_a_muted_input_is_no_background():
+    """Digital silence, then steady noise: no call."""
+    settings = Settings()
+    noise = 0.01 * np.random.default_rng(3).standard_normal((3, 60_000)).astype(np.float32)
+    noise[:, :20_000] = 0.0
+    assert not any(e.detection.call for e in process(settings, noise)[45:])
 
 
 # --- real input

@@ -73,6 +73,36 @@ BAD = {
         {"array": {"positions_m": [[0, 0, 0]]}, "audio": {"channel_map": [0]}},
         "array.positions_m: 1 microphones; 2 to 8",
     ),
+    "taken for 0 dB": ({"correlation": {"floor_dbfs": 0}}, "correlation.floor_dbfs: 0.0 dBFS is outside"),
+    "Nyquist to rounding": ({"correlation": {"band_hz": [300, 4999.9999]}}, "correlation.band_hz: 5000 Hz"),
+    "coarse grid": ({"correlation": {"oversample": 2}}, "correlation.oversample: 2 points is outside"),
+    "a number without end": ({"sim": {"distance_m": 10**400}}, "sim.distance_m: inf is not"),
+    "port": ({"mavlink": {"link": "tcp:127.0.0.1:99999"}}, "mavlink.link: port 99999 is not"),
+    "port 0": ({"mavlink": {"link": "udpin:0.0.0.0:0"}}, "mavlink.link: port 0 is not"),
+    "baud": ({"mavlink": {"link": "serial:/dev/ttyS0:99999999"}}, "mavlink.link: baud rate 99999999"),
+    "stall under a hop": (
+        {
+            "audio": {"rate_hz": 4000, "frame": 4096, "hop": 4096},
+            "daemon": {"stall_s": 0.5},
+            "correlation": {"band_hz": [300, 1900]},
+        },
+        "daemon.stall_s: 0.5 s is less than two hops",
+    ),
+    "upright pair": (
+        {
+            "array": {"positions_m": [[0, 0, 0], [0, 0, 0.1]]},
+            "audio": {"channel_map": [0, 1]},
+            "bearing": {"estimator": "two-mic"},
+        },
+        "array.positions_m: the first two stand one above the other",
+    ),
+    "learned on a line": (
+        {
+            "array": {"positions_m": [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]},
+            "bearing": {"estimator": "model:x"},
+        },
+        "array.positions_m: seen from above",
+    ),
     "same place": (
         {"array": {"positions_m": [TRIANGLE[0], TRIANGLE[1], TRIANGLE[1]]}},
         "array.positions_m: microphones 1 and 2 are at the same place",

@@ -98,6 +98,14 @@ def test_a_new_call_after_death_is_a_new_track():
     assert error_deg(track, 200.0) == pytest.approx(0.0, abs=1e-9)
 
 
+def test_one_frame_after_a_pause_is_not_much_confidence():
+    t = tracker(coast_s=3.0)
+    run(t, [heard(50.0)])
+    run(t, [heard(None)] * 35, QUIET)
+    (track,) = run(t, [heard(50.0)])
+    assert track.confidence < 0.2
+
+
 def test_a_single_wrong_bearing_is_left_out():
     t = tracker()
     run(t, [heard(50.0)] * 30)

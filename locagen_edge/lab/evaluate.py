@@ -125,9 +125,8 @@ def _predict(s: LabSettings, rows: list[dict[str, Any]]) -> None:
     at = [round(min(max(row["snr_db"], least), most) / STEP_DB) * STEP_DB for row in rows]
     ranges = [None if row["range_m"] is None else 2.0 ** round(math.log2(row["range_m"])) for row in rows]
     places = list(zip(at, ranges, strict=True))
-    swept = {
-        place: _swept(s, *place) for place in tqdm(set(places), desc="twin", unit=" sweeps", disable=None)
-    }
+    bar = tqdm(set(places), desc="twin", unit=" sweeps", disable=None)
+    swept = {place: _swept(s, *place) for place in bar}
     for row, place in zip(rows, places, strict=True):
         azimuth_deg, off_deg, off_m = swept[place]
         near = np.abs((azimuth_deg - row["azimuth_deg"] + 180.0) % 360.0 - 180.0) <= NEAR_DEG
@@ -172,9 +171,10 @@ def statistics(rows: list[dict[str, Any]]) -> dict[str, Any]:
     error = np.array([row["error_deg"] for row in rows if row["error_deg"] is not None])
     twin = np.array([row["twin_deg"] for row in rows])
     reach = np.array([row["twin_95_deg"] for row in rows if row["error_deg"] is not None])
-    metres = np.array([row["error_m"] for row in rows if row["error_m"] is not None])
     ranged = [row for row in rows if row["range_m"] is not None]
-    twin_m = [row["twin_m"] for row in ranged if row["twin_m"] is not None]
+    compared = [row for row in ranged if row["error_m"] is not None]
+    twin_m = [row["twin_m"] for row in compared if row["twin_m"] is not None]
+    metres = np.array([row["error_m"] for row in compared])
     told: dict[str, Any] = {
         "labels": len(rows),
         "without_bearing": len(rows) - len(error),
@@ -253,7 +253,7 @@ def _distance(told: dict[str, Any]) -> list[str]:
     if not told["range_labels"]:
         return ["No label has a range, so distance is not compared."]
     return [
-        "| distance, hyperbolic solver | field | twin, same SNR, azimuth and range |",
+        "| distance, hyperbolic solver | field | twin, same labels |",
         "| --- | --- | --- |",
         f"| mean \\|difference\\| where it can be known, m | {_number(told['range_mean_m'], '.2f')} | "
         f"{_number(told['twin_range_mean_m'], '.2f')} |",

@@ -1,13 +1,17 @@
 """Frame's level and misfit -> Detection: does something call?
 
-The in-band level is held against a background that falls fast and rises slowly, slower still while
-something calls, so that rotors are background and a shout is not. A frame is a call where it stands out of
-the background by `detection.snr_db` and one far source explains the delays of all pairs.
+The in-band level is held against the background: the lowest smoothed level of the last
+`detection.background_s` (minimum statistics: Martin, "Noise power spectral density estimation based on
+optimal smoothing and minimum statistics", IEEE Trans. Speech Audio Processing 9 (2001), for the whole band).
+Rotors that start or rise are background after that time, however far they rise, and a call that is longer is
+too. A frame is a call where it stands out of the background by `detection.snr_db` and one far source explains
+the delays.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 
@@ -15,13 +19,16 @@ from locagen_edge.settings import DetectionSettings
 from locagen_edge.types import Correlation, Detection
 
 SILENCE = 1e-12
-"""-120 dBFS: under any converter's noise."""
+"""-120 dBFS: under any converter's noise. Quieter frames are no background, but a muted input."""
 
-FALL_S = 0.5
-"""How fast the background follows a level that drops: rotors at idle, a gust's end."""
+SMOOTH_S = 0.2
+"""The level is smoothed over two frames before its minimum is taken."""
 
-CALL_SLOWDOWN = 5.0
-"""How much slower the background rises while something calls: a call of some seconds must not become it."""
+PIECES = 8
+"""The minimum is kept for pieces of the time, so that the oldest can be forgotten."""
+
+BIAS = 1.08
+"""The lowest of many smoothed levels is below their mean: 0.3 dB for 0.2 s of 4.4 kHz and 6 s of them."""
 
 SNR_RANGE_DB = (-30.0, 60.0)
 
@@ -31,20 +38,32 @@ class Detector:
 
     def __init__(self, settings: DetectionSettings):
         self._settings = settings
-        self._background: float | None = None
+        self._smooth: float | None = None
+        self._minima: deque[float] = deque(maxlen=PIECES)
+        self._piece_s = 0.0
 
     def __call__(self, correlation: Correlation, misfit: float, elapsed_s: float) -> Detection:
         """`elapsed_s`: since the previous frame."""
         power = correlation.power.astype(np.float64)
-        level = float(np.mean(power[power > SILENCE])) if (power > SILENCE).any() else SILENCE
-        if self._background is None:
-            self._background = level
+        live = power[power > SILENCE]
+        if not len(live):
+            return Detection(call=False, snr_db=SNR_RANGE_DB[0], level_dbfs=10.0 * math.log10(SILENCE))
+        level = float(live.mean())
+        background = self._follow(level, elapsed_s)
         least, most = SNR_RANGE_DB
-        excess = level / self._background - 1.0
+        excess = level / background - 1.0
         snr_db = min(max(10.0 * math.log10(excess), least), most) if excess > 0.0 else least
         call = snr_db >= self._settings.snr_db and misfit <= self._settings.misfit
-        rise_s = self._settings.background_s * (CALL_SLOWDOWN if call else 1.0)
-        time_s = FALL_S if level < self._background else rise_s
-        # in the logarithm, so that 30 dB up takes as long to learn as 3 dB
-        self._background *= (level / self._background) ** (1.0 - math.exp(-elapsed_s / time_s))
         return Detection(call=call, snr_db=snr_db, level_dbfs=10.0 * math.log10(level))
+
+    def _follow(self, level: float, elapsed_s: float) -> float:
+        """The background's power with this frame in it."""
+        if self._smooth is None:
+            self._smooth = level
+        self._smooth += (level - self._smooth) * (1.0 - math.exp(-elapsed_s / SMOOTH_S))
+        self._piece_s += elapsed_s
+        if not self._minima or self._piece_s > self._settings.background_s / PIECES:
+            self._minima.append(self._smooth)
+            self._piece_s = 0.0
+        self._minima[-1] = min(self._minima[-1], self._smooth)
+        return BIAS * min(self._minima)

@@ -57,7 +57,7 @@ def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearin
         if clipped[m] > CLIPPED_SHARE:
             found.add(f"microphone {m}: clipped, the gain is too high")
         if offset[m] > OFFSET:
-            found.add(f"microphone {m}: a constant offset of {offset[m]:.1f} of full scale")
+            found.add(f"microphone {m}: a constant offset, over a tenth of full scale")
     live = [m for m in mics if m not in dead | broken]
     for k, i in enumerate(live):
         for j in live[k + 1 :]:

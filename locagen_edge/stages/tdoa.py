@@ -32,8 +32,9 @@ RHO = 1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0)
 LEAST_NOISE = 4e-3
 """30 dB SNR: above it the peak differs from 1 by no more than it does from frame to frame."""
 
-LEAST_PEAK = 1e-3
-"""Below this there is no peak but rounding: with 450 bins of pure noise the highest is about 0.1."""
+CHANCE = 0.05
+"""Share of pairs of noise alone whose highest peak counts. Below that height there is no peak, no delay and,
+where too few are left, no bearing: the sigma above holds near the true peak, not where chance is higher."""
 
 
 class PeakPicker:
@@ -45,12 +46,15 @@ class PeakPicker:
         low, high = settings.band_hz
         bins = np.arange(math.ceil(low * frame / rate_hz), math.floor(high * frame / rate_hz) + 1)
         omega = 2.0 * np.pi * bins * rate_hz / frame
+        self._limit_s = array.spacing_m / speed_m_s
         self._slope_noise = math.sqrt(RHO * float(np.mean(omega**2)) / (2.0 * len(bins)))
         share = (np.arange(4096) + 0.5) / 4096
         power = -np.log(share)
         self._full_peak = float(np.mean(power / (power + 10 ** (settings.relative_floor_db / 10))))
+        # a lag of pure noise has the variance RHO / (2 K); the peak is the highest of the lags that differ
+        lags = 1.0 + 2.0 * float(self._limit_s.max()) * (high - low)
+        self._least_peak = math.sqrt(RHO / len(bins) * math.log(lags / CHANCE))
         self._step_s = 1.0 / (settings.oversample * rate_hz)
-        self._limit_s = array.spacing_m / speed_m_s
         self._outside: np.ndarray | None = None
         self._margin_s = LAG_MARGIN_SAMPLES / rate_hz
         self._rows = np.arange(len(array.pairs))
@@ -70,7 +74,7 @@ class PeakPicker:
         top = values[self._rows, best].astype(np.float64)
         right = values[self._rows, best + 1].astype(np.float64)
         bend = 2.0 * top - left - right
-        good = (top > LEAST_PEAK) & (bend > 0.0)
+        good = (top > self._least_peak) & (bend > 0.0)
         bend = np.where(good, bend, 1.0)
         shift = np.clip((right - left) / (2.0 * bend), -1.0, 1.0)
         peak = np.clip(top + (right - left) * shift / 4.0, 0.0, 1.0)

@@ -71,6 +71,8 @@ class Tracker:
                 self._update(state, bearing)
             elif state.outside >= LOST_AFTER:
                 state = self._born(bearing)
+            if state.outside == 0:
+                state.confidence += 1.0 - math.exp(-elapsed_s / CONFIDENCE_S)
         self._state = state
         return None if state is None else self._told(state)
 
@@ -110,7 +112,6 @@ class Tracker:
         gain = state.p[:, 0] / (state.p[0, 0] + self._noise(bearing.azimuth_sigma_rad))
         state.x = state.x + gain * innovation
         state.p = state.p - np.outer(gain, state.p[0])
-        state.confidence += 1.0 - math.exp(-state.silent_s / CONFIDENCE_S)
         state.silent_s = 0.0
         if bearing.elevation_rad is not None:
             variance = bearing.elevation_sigma_rad**2 * self._inflation

@@ -1,12 +1,24 @@
-"""The direction of a plane wave, by least squares over all pairs."""
+"""The direction of a plane wave, by least squares over all pairs.
+
+delay = baseline . u / c is linear in u, and |u| = 1. In the array's own two main axes linear least squares
+gives the start (Smith & Abel, "Closed-form least-squares source location estimation from range-difference
+measurements", IEEE Trans. ASSP 35 (1987), in its far-field limit). Across them there are two answers, on
+either side of the array. A flat array cannot tell them apart, and there it ends. Any other array follows both
+by Gauss-Newton steps on the sphere, since a third axis of a few millimetres says too little about u to be
+solved for by itself, and too much to be left out.
+
+Of two answers that fit alike the lower is taken: the source is below. Where the other is no higher than the
+horizon either (a tilted array), the sigma covers both.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from locagen_edge.geometry import angles
+from locagen_edge.geometry import angles, wrap
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import NOWHERE_RAD, DelayModel, Estimator, no_bearing
 from locagen_edge.types import F64, Bearing, Tdoa
@@ -14,69 +26,134 @@ from locagen_edge.types import F64, Bearing, Tdoa
 LARGEST_AZIMUTH_SIGMA_RAD = math.radians(60.0)
 """Beyond this the answer is "no bearing"."""
 
+FLAT_M = 1e-4
+"""Thinner than this an array is flat: 0.1 mm is 0.3 us, a tenth of what a frame's noise leaves."""
+
+ALIKE = 16.0
+"""Two answers count as alike where their squared misfits differ by less, per independent delay: 4 sigma, so
+that noise in a nearly flat array does not lift a caller on the ground into the sky. All pairs of M
+microphones hold each independent delay M / 2 times."""
+
+MOST_STEPS = 20
+CLOSE_RAD = 1e-8
+"""Gauss-Newton ends here; four steps are usual."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """One answer."""
+
+    u: F64
+    cost: float
+    """sum of squared (measured - fitted) delay over its sigma"""
+    azimuth: float
+    elevation: float
+    azimuth_sigma: float
+    elevation_sigma: float
+
 
 def far_field(settings: Settings, name: str = "far-field") -> Estimator:
-    """Weighted least squares for the direction of a plane wave over all pairs.
-
-    delay = baseline . u / c is linear in u. A flat array gives the part of u in its plane; the part across
-    follows from |u| = 1 and "the source is below". Smith & Abel, "Closed-form least-squares source location
-    estimation from range-difference measurements", IEEE Trans. ASSP 35 (1987), in its far-field limit.
-    """
+    """Weighted least squares for the unit vector to a far source. Needs three microphones off one line."""
     model = DelayModel.of(settings)
     correlation = model.correlation
-    _, _, axes = np.linalg.svd(model.array.baselines_m)
-    dims = model.array.dimensions
-    plane = axes[:dims]  # (dims, 3) orthonormal, spans the array
-    normal = axes[2] * (1.0 if axes[2, 2] >= 0.0 else -1.0)  # downwards: the source is below
-    slope = model.array.baselines_m @ plane.T / model.speed_m_s  # (pairs, dims)
+    _, thickness, axes = np.linalg.svd(model.array.baselines_m)
+    flat = len(thickness) < 3 or thickness[2] < FLAT_M
+    plane = axes[:2]  # (2, 3) orthonormal
+    normal = axes[2] * (1.0 if axes[2, 2] >= 0.0 else -1.0)  # downwards
+    slope = model.array.baselines_m / model.speed_m_s  # (pairs, 3) delay by u
+    spare = len(model.array.pairs) - 2
+    alike = ALIKE * model.array.mics / 2
 
     def estimate(tdoa: Tdoa) -> Bearing:
         heard = np.isfinite(tdoa.delay_s)
-        if not heard.all() and np.linalg.matrix_rank(slope[heard]) < dims:
-            return no_bearing(name)
-        sigma = model.sigma_s(tdoa)[heard]
-        delay, a = tdoa.delay_s[heard], slope[heard]
-        weighted = a / sigma[:, None]
-        gain = np.linalg.pinv(weighted) / sigma[None, :]  # (dims, pairs): weighted least squares
-        v = gain @ delay
-        covariance = gain @ (correlation[np.ix_(heard, heard)] * np.outer(sigma, sigma)) @ gain.T
-        return _from_direction(v, covariance, delay, a, sigma, plane, normal, name)
+        a, delay, sigma, related = slope, tdoa.delay_s, model.sigma_s(tdoa), correlation
+        if not heard.all():
+            a, delay, sigma, related = a[heard], delay[heard], sigma[heard], related[np.ix_(heard, heard)]
+            if len(a) < 2 or np.linalg.matrix_rank(a @ plane.T) < 2:
+                return no_bearing(name)
+        a, delay = a / sigma[:, None], delay / sigma
+        v = np.linalg.lstsq(a @ plane.T, delay, rcond=None)[0]
+        inside = float(v @ v)
+        if inside >= 1.0:
+            v = v / math.sqrt(inside)
+        across = normal * math.sqrt(max(1.0 - inside, 0.0))
+        starts = [plane.T @ v + across, plane.T @ v - across]
+        fits = [_judged(u, a, delay, related, plane, normal) for u in _followed(starts, a, delay, flat)]
+        return _chosen(fits, alike, max(spare + int(inside >= 1.0) - int((~heard).sum()), 1), name)
 
     return estimate
 
 
-def _from_direction(
-    v: F64, covariance: F64, delay: F64, slope: F64, sigma: F64, plane: F64, normal: F64, name: str
-) -> Bearing:
-    """Angles and their sigmas from the direction's part v in the array's own axes."""
-    length = float(np.linalg.norm(v))
-    if length < 1e-9:
-        v, length = v + 1e-9, 1e-9 * math.sqrt(len(v))
-    spare = len(delay) - len(plane)
-    if len(plane) == 3 or length > 1.0:
-        v = v / length  # onto the sphere, or the rim of the disc of possible directions
-        spare += 1
-    misfit = float(np.sqrt(np.sum(((delay - slope @ v) / sigma) ** 2) / max(spare, 1)))
-    covariance = covariance * max(misfit, 1.0) ** 2  # delays that disagree are worse than they claim
-    u = plane.T @ v
-    turn = plane.T  # du / dv
-    if len(plane) == 2:
-        across = math.sqrt(max(1.0 - float(v @ v), 0.0))
-        u = u + normal * across
-        # at the rim the derivative is infinite and the linear theory ends: the sigma of v bounds it
-        bounded = max(across, math.sqrt(math.sqrt(float(np.trace(covariance)))))
-        turn = turn - np.outer(normal, v) / bounded
-    spread = turn @ covariance @ turn.T  # (3, 3) of u
+def _followed(starts: list[F64], a: F64, delay: F64, flat: bool) -> list[F64]:
+    """The starts at the nearest minima of |delay - a u| on the sphere."""
+    if flat:
+        return starts
+    ends = []
+    for start in starts:
+        u = start
+        for _ in range(MOST_STEPS):
+            tangent = _tangent(u)
+            # at the rim of a nearly flat array one direction is hardly seen: rcond leaves it alone
+            step = np.linalg.lstsq(a @ tangent.T, delay - a @ u, rcond=1e-3)[0]
+            length = float(np.linalg.norm(step))
+            u = u + step @ tangent * min(1.0, 0.5 / max(length, 1e-12))
+            u = u / np.linalg.norm(u)
+            if length < CLOSE_RAD:
+                break
+        ends.append(u)
+    return ends
+
+
+def _tangent(u: F64) -> F64:
+    """(2, 3): across the direction level with the horizon, and towards the zenith."""
+    flat = math.hypot(u[0], u[1])
+    level = np.array([-u[1], u[0], 0.0]) / flat if flat > 1e-9 else np.array([0.0, 1.0, 0.0])
+    return np.stack([level, np.cross(level, u)])
+
+
+def _judged(u: F64, a: F64, delay: F64, related: F64, plane: F64, normal: F64) -> _Fit:
+    """Misfit and sigmas of an answer; `a` and `delay` are in units of the delays' sigma."""
+    residual = delay - a @ u
     azimuth, elevation = angles(u)
-    flat = max(float(u[0] ** 2 + u[1] ** 2), 1e-12)
-    across_flat = np.array([-u[1], u[0], 0.0]) / flat
-    azimuth_sigma = math.sqrt(max(float(across_flat @ spread @ across_flat), 0.0))
-    elevation_sigma = math.sqrt(max(spread[2, 2], 0.0)) / max(math.cos(elevation), 1e-3)
+    # Where the wave travels in the array's plane, its tilt out of it is seen to second order only. The sigma
+    # of what is seen in the plane bounds it, so the sigmas are taken from that far out of the plane.
+    slope = a @ plane.T
+    in_plane = math.sqrt(float(np.linalg.eigvalsh(slope.T @ slope)[0]))
+    least = min(1.0 / math.sqrt(max(in_plane, 1e-12)), 0.5)
+    out = float(u @ normal)
+    if abs(out) < least:
+        u = u - normal * out
+        u = u / np.linalg.norm(u) * math.sqrt(1.0 - least**2) + normal * math.copysign(least, out)
+    gain = np.linalg.pinv(a @ _tangent(u).T, rcond=1e-9)
+    variance = np.diag(gain @ related @ gain.T)
+    return _Fit(
+        u,
+        float(residual @ residual),
+        azimuth,
+        elevation,
+        math.sqrt(variance[0]) / max(math.cos(elevation), 1e-9),
+        math.sqrt(variance[1]),
+    )
+
+
+def _chosen(fits: list[_Fit], alike: float, spare: int, name: str) -> Bearing:
+    fits.sort(key=lambda fit: fit.cost)
+    best, other = fits
+    rival = other.cost - best.cost < alike
+    if rival and other.u[2] > best.u[2]:
+        best, other = other, best
+    misfit = math.sqrt(best.cost / spare)
+    # delays that disagree are worse than they claim
+    azimuth_sigma = best.azimuth_sigma * max(misfit, 1.0)
+    elevation_sigma = best.elevation_sigma * max(misfit, 1.0)
+    if rival and other.elevation <= 0.0:
+        azimuth_sigma += abs(wrap(other.azimuth - best.azimuth)) / 2.0
+        elevation_sigma += abs(other.elevation - best.elevation) / 2.0
     known = azimuth_sigma <= LARGEST_AZIMUTH_SIGMA_RAD
     return Bearing(
-        azimuth_rad=azimuth if known else None,
+        azimuth_rad=best.azimuth if known else None,
         azimuth_sigma_rad=min(azimuth_sigma, NOWHERE_RAD),
-        elevation_rad=elevation,
+        elevation_rad=best.elevation,
         elevation_sigma_rad=min(elevation_sigma, NOWHERE_RAD),
         misfit=misfit,
         estimator=name,

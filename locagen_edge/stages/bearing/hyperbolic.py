@@ -21,6 +21,9 @@ Two hyperbolas can cross twice: three microphones then have two exact answers, o
 five spacings. Several starts find both; of answers that fit alike the farther is given (a caller is rarely
 at arm's length), and the range counts as not observable."""
 
+SOLID = 0.2
+"""Share of its width from which an array's height counts: a thinner one cannot look up and down."""
+
 FARTHEST_M = 1e4
 """Where the search ends: beyond a kilometre a curved wave differs from a plane one by nanoseconds."""
 
@@ -31,21 +34,23 @@ def hyperbolic(settings: Settings) -> Estimator:
     Minimises sum_m ((d_m - d_1) - c tau_1m)^2 over positions, d_m the distance to microphone m, by
     Levenberg-Marquardt (Nocedal & Wright, *Numerical Optimization*, section 10.3) in direction and inverse
     range, in which far sources are as well-behaved as near ones (Civera, Davison & Montiel, "Inverse depth
-    parametrization for monocular SLAM", IEEE Trans. Robotics 24, 2008). A flat array gives x and y in its
-    own height, so a source far below is taken for a nearer one: the far field gives the better elevation.
+    parametrization for monocular SLAM", IEEE Trans. Robotics 24, 2008). A flat array finds positions in its
+    own plane, so a source far below is taken for a nearer one: the far field gives the better elevation.
     """
     model = DelayModel.of(settings)
     array, speed = model.array, model.speed_m_s
     base = [row for row, (i, _) in enumerate(array.pairs) if i == 0]
     others = array.positions_m[1:]
-    solid = array.dimensions == 3
+    _, extent, axes = np.linalg.svd(array.positions_m - array.positions_m.mean(axis=0))
+    solid = len(extent) == 3 and extent[2] > SOLID * extent[1]
+    normal = axes[2]
     plane_wave = far_field(settings)
     correlation = model.correlation[np.ix_(base, base)]
     centre = array.positions_m.mean(axis=0)
     nearest = float(np.linalg.norm(array.positions_m - centre, axis=1).max()) * 1.05
 
     def place(q: F64) -> F64:
-        u = direction(q[0], q[1] if solid else 0.0)
+        u = direction(q[0], q[1]) if solid else _in_plane(q[0], normal)
         position: F64 = centre + u / min(max(q[-1], 1.0 / FARTHEST_M), 1.0 / nearest)
         return position
 
@@ -72,10 +77,19 @@ def hyperbolic(settings: Settings) -> Estimator:
         noise = correlation * np.outer(sigma, sigma)
         gain = np.linalg.pinv(jacobian)
         covariance = gain @ noise @ gain.T
-        bearing = _from_position(q, place(q), covariance, math.sqrt(cost), sigma, start, solid)
+        fix = _fix(q, place, covariance)
         unique = rival - q[-1] <= 3.0 * math.sqrt(max(float(covariance[-1, -1]), 0.0)) + 1e-6
-        assert bearing.fix is not None
-        return bearing if unique else replace(bearing, fix=replace(bearing.fix, range_observable=False))
+        misfit = max(start.misfit, math.sqrt(cost) / float(np.linalg.norm(sigma)))
+        spread = np.sqrt(np.maximum(np.diag(covariance), 0.0)) * max(misfit, 1.0)
+        return Bearing(
+            azimuth_rad=wrap(float(q[0])),
+            azimuth_sigma_rad=min(float(spread[0]), NOWHERE_RAD),
+            elevation_rad=float(q[1]) if solid else None,
+            elevation_sigma_rad=min(float(spread[1]), NOWHERE_RAD) if solid else NOWHERE_RAD,
+            misfit=misfit,
+            estimator="hyperbolic",
+            fix=replace(fix, range_observable=fix.range_observable and unique),
+        )
 
     return estimate
 
@@ -119,30 +133,19 @@ def _jacobian(f: Callable[[F64], F64], q: F64) -> F64:
     return np.stack(columns, axis=1)
 
 
-def _from_position(
-    q: F64, position: F64, covariance: F64, residual_m: float, sigma_m: F64, start: Bearing, solid: bool
-) -> Bearing:
-    """Angles, range and what they are worth, from direction and inverse range with their covariance."""
+def _fix(q: F64, place: Callable[[F64], F64], covariance: F64) -> Fix:
+    """The position, from direction and inverse range with their covariance."""
     inverse, inverse_sigma = float(q[-1]), math.sqrt(max(float(covariance[-1, -1]), 0.0))
     range_m = 1.0 / min(max(inverse, 1.0 / FARTHEST_M), 1e3)
     # to first order; where the inverse range is not three sigmas from zero, that theory has no meaning
     observable = inverse > 3.0 * inverse_sigma and inverse > 1.0 / FARTHEST_M
-    range_sigma = inverse_sigma * range_m**2
-    azimuth = wrap(float(q[0]))
-    elevation = float(q[1]) if solid else 0.0
-    u = direction(azimuth, elevation)
-    across = direction(azimuth + math.pi / 2) * math.cos(elevation) * range_m
-    up = np.array([-u[2] * -math.cos(azimuth), -u[2] * -math.sin(azimuth), -math.cos(elevation)]) * range_m
-    columns = [across, up, -u * range_m**2] if solid else [across, -u * range_m**2]
-    turn = np.stack(columns, axis=1)
-    return Bearing(
-        azimuth_rad=azimuth,
-        azimuth_sigma_rad=min(math.sqrt(max(float(covariance[0, 0]), 0.0)), NOWHERE_RAD),
-        elevation_rad=elevation if solid else None,
-        elevation_sigma_rad=(
-            min(math.sqrt(max(float(covariance[1, 1]), 0.0)), NOWHERE_RAD) if solid else NOWHERE_RAD
-        ),
-        misfit=max(start.misfit, residual_m / float(np.linalg.norm(sigma_m))),
-        estimator="hyperbolic",
-        fix=Fix(position, turn @ covariance @ turn.T, range_m, range_sigma, observable),
-    )
+    turn = _jacobian(place, q)
+    return Fix(place(q), turn @ covariance @ turn.T, range_m, inverse_sigma * range_m**2, observable)
+
+
+def _in_plane(azimuth_rad: float, normal: F64) -> F64:
+    """Unit vector (3,) of this azimuth in the plane across `normal`, which is not level."""
+    level = direction(azimuth_rad)
+    u = level - np.array([0.0, 0.0, float(level @ normal) / normal[2]])
+    unit: F64 = u / np.linalg.norm(u)
+    return unit

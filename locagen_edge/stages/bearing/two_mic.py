@@ -18,7 +18,7 @@ def two_mic(settings: Settings) -> Estimator:
     """
     model = DelayModel.of(settings)
     baseline = model.array.baselines_m[0]
-    spacing = float(model.array.spacing_m[0])
+    spacing = math.hypot(baseline[0], baseline[1])  # a source on the horizon does not see a pair's tilt
     along = math.atan2(baseline[1], baseline[0])
     sides = (wrap(along - math.pi / 2), wrap(along + math.pi / 2))
     # cos, then sin with a nudge: ahead wins, and of left and right the right

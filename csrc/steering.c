@@ -1,0 +1,729 @@
+/* steering.c - maximum likelihood over directions: set-up, memory of frames, coarse grid, refinement.
+ *
+ * What is scored and why stands in locagen.h. How it is made cheap: all of a coarse grid's directions are
+ * scored on bins added up by the few (up to eight, as long as no phase across the array differs by more than
+ * THIN_PHASE from that of their middle), and q is averaged over as many neighbours as it would be on the
+ * fine bins. From the best one Newton's method goes on to the continuum, on all bins: eight directions are
+ * scored side by side, which is just what finite differences of a parabola in two dimensions take.
+ *
+ * Newton's coordinates are direction cosines in the plane of a flat array: the score is nearly a parabola in
+ * them, and they know neither rim nor pole. Beyond the rim (noise may put the best there) the best on it is
+ * taken. Of two directions that a flat array cannot tell apart the lower one is meant. An array in space has
+ * the two arcs of the tangent plane for coordinates.
+ */
+#include "steering.h"
+
+#include <float.h>
+#include <math.h>
+#include <string.h>
+
+static const double PI = 3.14159265358979323846;
+
+/* 0.15 radians at the outer bins of a block lower their mean by 0.4 % and do not shift it. */
+static const double THIN_PHASE = 0.15;
+
+/* Half widths of the parabola through the scores, as phase across the array at the band's upper end: wide
+ * where the grid's own step is to be bridged, at last as narrow as float's rounding of the scores allows. */
+static const double WIDTHS[] = {0.6, 0.4, 0.2, 0.2};
+
+static const double LOBE = 3.0;  /* radians of phase from a lobe's top to beyond its foot */
+static const float CLOSE = 0.9f; /* the grid costs a lobe less than a tenth of its score */
+
+static const double LOST = 0.1;          /* a microphone missing from more of R does not count */
+static const double SILENT = 1e-5;       /* power under the loudest one's: -50 dB */
+static const float LEAST_DENOMINATOR = 1e-6f; /* of microphones: loading keeps the true ones above it */
+static const float LEAST_AFTER_NULL = 0.05f;  /* nearer to a nulled source nothing can be told */
+static const double WHITE_SHARE = 1e-7;  /* of the signal, the least noise that is estimated: float's own */
+
+enum { MOST_THINNING = 8, LEAST_COARSE = 8, MOST_LOBES = 4 };
+
+static steer *state_of(const void *memory)
+{
+    return (steer *)locagen_aligned(memory);
+}
+
+static int within(double x, double low, double high)
+{
+    return x >= low && x <= high;
+}
+
+static double dot(const double a[3], const double b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static double normalise(double a[3])
+{
+    double length = sqrt(dot(a, a));
+    for (int n = 0; n < 3 && length > 0; n++)
+        a[n] /= length;
+    return length;
+}
+
+static void cross(const double a[3], const double b[3], double to[3])
+{
+    to[0] = a[1] * b[2] - a[2] * b[1];
+    to[1] = a[2] * b[0] - a[0] * b[2];
+    to[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* p_m - p_0, metres, and the longest of them. */
+static double arms(const locagen_steer_config *c, double arm[MOST_MICS][3], int *longest)
+{
+    double most = 0;
+    *longest = 0;
+    for (int m = 0; m < c->mics; m++) {
+        for (int n = 0; n < 3; n++)
+            arm[m][n] = (double)c->positions_m[3 * m + n] - c->positions_m[n];
+        if (dot(arm[m], arm[m]) > most)
+            most = dot(arm[m], arm[m]), *longest = m;
+    }
+    return sqrt(most);
+}
+
+static int check(const locagen_steer_config *c)
+{
+    if (c == NULL)
+        return LOCAGEN_E_NULL;
+    int error = locagen_spectrum_check(c->mics, c->frame, c->rate_hz, c->band_low_hz, c->band_high_hz);
+    if (error != LOCAGEN_OK)
+        return error;
+    if (c->hop != 0 && (c->hop < c->frame / 8 || c->hop > 1 << 24))
+        return LOCAGEN_E_HOP;
+    if (!within(c->taper, 0, 1))
+        return LOCAGEN_E_TAPER;
+    if (c->smooth_bins < 0 || c->smooth_bins > 64)
+        return LOCAGEN_E_SMOOTH;
+    if (!within(c->loading, 0.999e-5, 1) || !within(c->floor, 0.999e-15, 1))
+        return LOCAGEN_E_NOISE;
+    for (int n = 0; n < 3 * c->mics; n++)
+        if (!within(c->positions_m[n], -10, 10))
+            return LOCAGEN_E_ARRAY;
+    double arm[MOST_MICS][3];
+    int longest;
+    if (arms(c, arm, &longest) < 1e-3 || !within(c->speed_m_s, 100, 2000))
+        return LOCAGEN_E_ARRAY;
+    if (c->azimuths < 8 || c->azimuths > 720 || c->elevations < 2 || c->elevations > 180)
+        return LOCAGEN_E_GRID;
+    return LOCAGEN_OK;
+}
+
+/* The array's plane: along its longest arm, along what is left of the others, and across. */
+static void find_plane(steer *s, const locagen_steer_config *c)
+{
+    double arm[MOST_MICS][3], most = 1e-3; /* 1 mm is a position's tolerance */
+    int longest;
+    arms(c, arm, &longest);
+    double *x = s->axes[0], *y = s->axes[1], *z = s->axes[2];
+    memcpy(x, arm[longest], sizeof s->axes[0]);
+    normalise(x);
+    /* All in a line: any second axis will do; a level one keeps "below" below. */
+    const double down[3] = {0, 0, 1};
+    cross(down, x, y);
+    if (normalise(y) < 1e-9)
+        y[0] = 1, y[1] = y[2] = 0;
+    for (int m = 0; m < c->mics; m++) {
+        double rest[3];
+        for (int n = 0; n < 3; n++)
+            rest[n] = arm[m][n] - dot(arm[m], x) * x[n];
+        double length = normalise(rest);
+        if (length > most)
+            most = length, memcpy(y, rest, sizeof rest);
+    }
+    cross(x, y, z);
+    for (int n = 0; n < 3 && z[2] < 0; n++)
+        y[n] = -y[n];
+    cross(x, y, z);
+    s->flat = 1;
+    for (int m = 0; m < c->mics; m++)
+        s->flat &= fabs(dot(arm[m], z)) <= 1e-3;
+}
+
+static void lay_out_response(locagen_response *r, const steer *s, int bins, int half, int weight,
+                             locagen_arena *a)
+{
+    r->bins = bins;
+    r->stride = (bins + BIN_BLOCK - 1) / BIN_BLOCK * BIN_BLOCK;
+    r->half = half < bins - 1 ? half : bins - 1;
+    r->weight = (float)weight;
+    r->planes = locagen_take(a, (size_t)(2 + 4 * s->pairs) * (size_t)r->stride);
+    r->share = locagen_take(a, (size_t)bins);
+}
+
+/* Sizes and places; with a null base only the arena's count is meant. */
+static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
+{
+    memset(s, 0, sizeof *s);
+    locagen_spectrum_lay_out(&s->spectrum, c->mics, c->frame, c->rate_hz, c->band_low_hz, c->band_high_hz, a);
+    s->mics = c->mics;
+    s->pairs = c->mics * (c->mics - 1) / 2;
+    s->bins = s->spectrum.last_bin - s->spectrum.first_bin + 1;
+    s->stride = (s->bins + BIN_BLOCK - 1) / BIN_BLOCK * BIN_BLOCK;
+    s->loading = c->loading, s->floor = c->floor;
+    s->azimuths = c->azimuths, s->elevations = c->elevations;
+    find_plane(s, c);
+    s->whole_sphere = !s->flat;
+
+    double per_metre = 2 * PI * c->rate_hz / c->frame / c->speed_m_s, arm[MOST_MICS][3], longest = 0;
+    int at;
+    arms(c, arm, &at);
+    for (int m = 0; m < c->mics; m++)
+        for (int n = 0; n < 3; n++)
+            s->offset[m][n] = per_metre * arm[m][n];
+    for (int i = 0; i < c->mics; i++)
+        for (int j = 0; j < i; j++) {
+            double d[3] = {arm[i][0] - arm[j][0], arm[i][1] - arm[j][1], arm[i][2] - arm[j][2]};
+            longest = fmax(longest, sqrt(dot(d, d)));
+        }
+    s->reach = per_metre * longest * s->spectrum.last_bin;
+    int thinning = 1;
+    while (thinning < MOST_THINNING && 2 * thinning <= 2 * c->smooth_bins + 1 &&
+           s->bins / (2 * thinning) >= LEAST_COARSE &&
+           (2 * thinning - 1) / 2.0 * per_metre * longest < THIN_PHASE)
+        thinning *= 2;
+
+    size_t planes = (size_t)(s->mics * s->mics) * (size_t)s->stride, mics = (size_t)s->mics;
+    s->bins_re = locagen_take(a, mics * (size_t)s->stride);
+    s->bins_im = locagen_take(a, mics * (size_t)s->stride);
+    s->noise = locagen_take(a, planes), s->signal = locagen_take(a, planes);
+    lay_out_response(&s->fine, s, s->bins, c->smooth_bins, 1, a);
+    /* As many bins in the average: 2 half + 1 blocks nearest to 2 smooth_bins + 1 bins. */
+    double blocks = (2 * c->smooth_bins + 1) / (double)thinning;
+    lay_out_response(&s->coarse, s, s->bins / thinning, (int)floor((blocks - 1) / 2 + 0.5), thinning, a);
+    s->nulls = locagen_take(a, 2 * (mics - 1) * mics * (size_t)s->stride);
+    size_t groups = ((size_t)(s->azimuths * s->elevations) + DIRECTIONS - 1) / DIRECTIONS;
+    s->grid = locagen_take(a, groups * (mics - 1) * 4 * DIRECTIONS);
+    s->aim = locagen_take(a, (mics - 1) * 4 * DIRECTIONS);
+    s->scores = locagen_take(a, 2 * groups * DIRECTIONS);
+    s->q = locagen_take(a, (size_t)s->bins * DIRECTIONS);
+    s->grid_u = (double *)(void *)locagen_take(a, 2 * 3 * groups * DIRECTIONS);
+}
+
+static void fill_response(const locagen_response *r)
+{
+    for (int k = 0; k < r->bins; k++) {
+        int first = k - r->half > 0 ? k - r->half : 0;
+        int last = k + r->half < r->bins - 1 ? k + r->half : r->bins - 1;
+        r->share[k] = 1.0f / (float)(last - first + 1);
+    }
+}
+
+/* The phases of direction u in one lane: at bin `first`, and from bin to bin. */
+static void put_phases(const steer *s, const double u[3], double first, double step, float *lane)
+{
+    for (int m = 1; m < s->mics; m++, lane += 4 * DIRECTIONS) {
+        double phase = dot(s->offset[m], u);
+        lane[0] = (float)cos(first * phase), lane[DIRECTIONS] = (float)sin(first * phase);
+        lane[2 * DIRECTIONS] = (float)cos(step * phase), lane[3 * DIRECTIONS] = (float)sin(step * phase);
+    }
+}
+
+static double grid_elevation(const steer *s, int row)
+{
+    double span = s->whole_sphere ? PI : PI / 2;
+    return span * (s->whole_sphere ? 0.5 : 0) - span * (row + 0.5) / s->elevations;
+}
+
+static double grid_azimuth(const steer *s, int column)
+{
+    double turn = 2 * PI * column / s->azimuths;
+    return turn < PI ? turn : turn - 2 * PI;
+}
+
+static void fill_grid(steer *s)
+{
+    int count = s->azimuths * s->elevations;
+    double thinning = (double)s->coarse.weight;
+    for (int n = 0; n < (count + DIRECTIONS - 1) / DIRECTIONS * DIRECTIONS; n++) {
+        int at = n < count ? n : count - 1;
+        double elevation = grid_elevation(s, at / s->azimuths), azimuth = grid_azimuth(s, at % s->azimuths);
+        double *u = s->grid_u + 3 * n;
+        u[0] = cos(elevation) * cos(azimuth), u[1] = cos(elevation) * sin(azimuth), u[2] = -sin(elevation);
+        float *group = s->grid + (size_t)(n / DIRECTIONS) * (size_t)(s->mics - 1) * 4 * DIRECTIONS;
+        put_phases(s, u, s->spectrum.first_bin + (thinning - 1) / 2, thinning, group + n % DIRECTIONS);
+    }
+}
+
+/* A look is a bin of an untapered frame. Tapering makes neighbouring bins depend on each other, overlap
+ * neighbouring frames (Welch 1967, "The use of fast Fourier transform for the estimation of power spectra"):
+ * the variance of an average is over sum(w^2)^2 / (N sum(w^4)) looks in a frame, and the coherence of
+ * windows h apart is (sum(w(n) w(n + h)) / sum(w^2))^2. */
+static void count_looks(steer *s, const locagen_steer_config *c)
+{
+    double squares = 0, fourths = 0;
+    for (int n = 0; n < c->frame; n++) {
+        double w = locagen_window(n, c->frame, c->taper);
+        squares += w * w, fourths += w * w * w * w;
+    }
+    s->looks = squares * squares / (c->frame * fourths);
+    for (int hop = 1; c->hop > 0 && hop <= 8 && hop * c->hop < c->frame; hop++, s->hops++) {
+        double sum = 0;
+        for (int n = 0; n + hop * c->hop < c->frame; n++)
+            sum += locagen_window(n, c->frame, c->taper) *
+                   locagen_window(n + hop * c->hop, c->frame, c->taper);
+        s->overlap[hop - 1] = sum * sum / (squares * squares);
+    }
+}
+
+size_t locagen_steer_sizeof(const locagen_steer_config *config)
+{
+    if (check(config) != LOCAGEN_OK)
+        return 0;
+    steer s;
+    locagen_arena count = {NULL, 0};
+    locagen_take(&count, sizeof s / sizeof(float) + 1);
+    lay_out(&s, config, &count);
+    return count.used + LOCAGEN_LINE - 1;
+}
+
+int locagen_steer_init(locagen_steer *memory, const locagen_steer_config *config)
+{
+    int error = memory == NULL ? LOCAGEN_E_NULL : check(config);
+    if (error != LOCAGEN_OK)
+        return error;
+    memset(memory, 0, locagen_steer_sizeof(config));
+    steer *s = state_of(memory);
+    locagen_arena room = {(char *)s, 0};
+    locagen_take(&room, sizeof *s / sizeof(float) + 1);
+    lay_out(s, config, &room);
+    locagen_spectrum_init(&s->spectrum, config->taper);
+    fill_response(&s->fine);
+    fill_response(&s->coarse);
+    fill_grid(s);
+    count_looks(s, config);
+
+    s->paths = &locagen_steer_quad;
+#if defined(__x86_64__)
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+        s->paths = &locagen_steer_avx2;
+#endif
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_reset(locagen_steer *memory)
+{
+    if (memory == NULL)
+        return LOCAGEN_E_NULL;
+    steer *s = state_of(memory);
+    size_t row = (size_t)s->stride * sizeof(float), mics = (size_t)s->mics;
+    memset(s->bins_re, 0, mics * row), memset(s->bins_im, 0, mics * row);
+    memset(s->noise, 0, mics * mics * row), memset(s->signal, 0, mics * mics * row);
+    memset(s->lost_noise, 0, sizeof s->lost_noise), memset(s->lost_signal, 0, sizeof s->lost_signal);
+    memset(s->heard_weights, 0, sizeof s->heard_weights);
+    s->learnt = s->heard = s->heard_variance = 0;
+    s->frame_mics = 0;
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_listen(locagen_steer *memory, const float *in, float *power)
+{
+    if (memory == NULL || in == NULL || power == NULL)
+        return LOCAGEN_E_NULL;
+    steer *s = state_of(memory);
+    int bad = s->paths->listen(s, in, power);
+    double loudest = 0;
+    for (int m = 0; m < s->mics; m++)
+        loudest = fmax(loudest, power[m]);
+    s->frame_mics = 0;
+    for (int m = 0; m < s->mics; m++)
+        if (!(bad >> m & 1) && power[m] >= SILENT * loudest)
+            s->frame_mics |= 1 << m;
+    return bad;
+}
+
+static double add(const steer *s, double weight, float share, float *lost, float *matrix)
+{
+    s->paths->add(s, 1.0f - share, share, matrix);
+    for (int m = 0; m < s->mics; m++)
+        lost[m] = (1.0f - share) * lost[m] + (s->frame_mics >> m & 1 ? 0.0f : share);
+    return (1.0f - share) * weight + share;
+}
+
+int locagen_steer_learn(locagen_steer *memory, float share)
+{
+    if (memory == NULL)
+        return LOCAGEN_E_NULL;
+    if (!within(share, 0, 1))
+        return LOCAGEN_E_SHARE;
+    steer *s = state_of(memory);
+    s->learnt = add(s, s->learnt, share, s->lost_noise, s->noise);
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_hear(locagen_steer *memory, float share)
+{
+    if (memory == NULL)
+        return LOCAGEN_E_NULL;
+    if (!within(share, 0, 1))
+        return LOCAGEN_E_SHARE;
+    steer *s = state_of(memory);
+    s->heard = add(s, s->heard, share, s->lost_signal, s->signal);
+    double keep = 1.0f - share, with_old = 0;
+    for (int hop = 0; hop < s->hops; hop++)
+        with_old += s->overlap[hop] * keep * s->heard_weights[hop];
+    double fresh = (double)share;
+    s->heard_variance = keep * keep * s->heard_variance + fresh * fresh + 2 * fresh * with_old;
+    for (int hop = 7; hop > 0; hop--)
+        s->heard_weights[hop] = keep * s->heard_weights[hop - 1];
+    s->heard_weights[0] = share;
+    return LOCAGEN_OK;
+}
+
+/* Microphones that are in both R_n and R_x, as a mask; 0 where nothing can be looked for. */
+static int usable_mics(const steer *s)
+{
+    int mask = 0, count = 0;
+    for (int m = 0; m < s->mics; m++) {
+        int lost = s->lost_signal[m] > LOST * s->heard || s->lost_noise[m] > LOST * s->learnt;
+        mask |= !lost << m;
+        count += !lost;
+    }
+    return s->heard > 0 && count >= 2 ? mask : 0;
+}
+
+static void score_grid(const steer *s, enum locagen_measure measure)
+{
+    int groups = (s->azimuths * s->elevations + DIRECTIONS - 1) / DIRECTIONS;
+    float *mean_q = s->scores + (long)groups * DIRECTIONS; /* nobody reads it */
+    s->paths->score(s, &s->coarse, measure, s->grid, groups, s->scores, mean_q);
+}
+
+/* Whether the lobe of one direction may hold the other. */
+static int same_lobe(const steer *s, const double u[3], const double v[3])
+{
+    double d[3] = {u[0] - v[0], u[1] - v[1], u[2] - v[2]}, across = s->flat ? dot(d, s->axes[2]) : 0;
+    return s->reach * sqrt(fmax(0, dot(d, d) - across * across)) < LOBE;
+}
+
+/* The best direction of the grid outside the lobes of those before it. */
+static int next_on_grid(const steer *s, const int *before, int count_before)
+{
+    int best = -1;
+    for (int n = 0; n < s->azimuths * s->elevations; n++) {
+        if (best >= 0 && !(s->scores[n] > s->scores[best]))
+            continue;
+        int apart = 1;
+        for (int i = 0; i < count_before && apart; i++)
+            apart = !same_lobe(s, s->grid_u + 3 * n, s->grid_u + 3 * before[i]);
+        if (apart)
+            best = n;
+    }
+    return best;
+}
+
+typedef struct {
+    double u[3], score, mean_q;
+    double along[2][3];  /* the coordinates' axes */
+    double hessian[3];   /* xx, xy, yy */
+} aim;
+
+/* Arcs of the tangent plane: towards greater azimuth, towards greater elevation. Straight up or down azimuth
+ * 0 is meant. */
+static void arcs(const double u[3], double azimuth[3], double elevation[3])
+{
+    double level = hypot(u[0], u[1]);
+    double c = level > 1e-9 ? u[0] / level : 1, s = level > 1e-9 ? u[1] / level : 0;
+    azimuth[0] = -s, azimuth[1] = c, azimuth[2] = 0;
+    elevation[0] = u[2] * c, elevation[1] = u[2] * s, elevation[2] = -level;
+}
+
+/* u moved by (x, y) of its coordinates. Off the sphere where the array is flat and the plane is left: phases
+ * are linear in u, so that the score is defined there too. */
+static void moved(const steer *s, const aim *a, double x, double y, double to[3])
+{
+    for (int n = 0; n < 3; n++)
+        to[n] = a->u[n] + x * a->along[0][n] + y * a->along[1][n];
+    if (!s->flat)
+        normalise(to);
+}
+
+/* The best step on the parabola, no longer than `most`. A direction that the score does not depend on (an
+ * array in a line) and one that it curves upwards in are followed uphill only a little. */
+static void newton(const double g[2], const double h[3], double most, double step[2])
+{
+    double middle = -(h[0] + h[2]) / 2, apart = hypot((h[0] - h[2]) / 2, h[1]);
+    double largest = fabs(middle) + apart, least = 1e-3 * largest + 1e-30;
+    /* Damped until the smaller of -H's own values is positive (Levenberg). */
+    double damping = middle - apart < least ? least - (middle - apart) : 0;
+    double a = -h[0] + damping, b = -h[1], c = -h[2] + damping, det = a * c - b * b;
+    step[0] = det > 0 ? (c * g[0] - b * g[1]) / det : 0;
+    step[1] = det > 0 ? (a * g[1] - b * g[0]) / det : 0;
+    double length = hypot(step[0], step[1]);
+    if (length > most)
+        step[0] *= most / length, step[1] *= most / length;
+}
+
+/* One Newton step from scores at the corners of a hexagon of half width h and its middle. */
+static void refine_once(const steer *s, enum locagen_measure measure, double h, aim *a)
+{
+    static const double AT[DIRECTIONS][2] = {
+        {0, 0}, {1, 0}, {-1, 0}, {0, 1}, {0, -1}, {1, 1}, {-1, -1}, {0, 0},
+    };
+    float score[DIRECTIONS], mean_q[DIRECTIONS];
+    if (s->flat)
+        memcpy(a->along, s->axes, sizeof a->along);
+    else
+        arcs(a->u, a->along[0], a->along[1]);
+    for (int n = 0; n < DIRECTIONS; n++) {
+        double u[3];
+        moved(s, a, h * AT[n][0], h * AT[n][1], u);
+        put_phases(s, u, s->spectrum.first_bin, 1, s->aim + n);
+    }
+    s->paths->score(s, &s->fine, measure, s->aim, 1, score, mean_q);
+    double f[DIRECTIONS];
+    for (int n = 0; n < DIRECTIONS; n++)
+        f[n] = (double)score[n];
+    double g[2] = {(f[1] - f[2]) / (2 * h), (f[3] - f[4]) / (2 * h)}, step[2];
+    a->hessian[0] = (f[1] + f[2] - 2 * f[0]) / (h * h);
+    a->hessian[2] = (f[3] + f[4] - 2 * f[0]) / (h * h);
+    a->hessian[1] = (f[5] + f[6] - f[1] - f[2] - f[3] - f[4] + 2 * f[0]) / (2 * h * h);
+    const double *m = a->hessian;
+    newton(g, m, 2 * h, step);
+    if (s->flat) {
+        double v[2] = {dot(a->u, s->axes[0]), dot(a->u, s->axes[1])};
+        double r = hypot(v[0] + step[0], v[1] + step[1]);
+        if (r > 1) {
+            /* Beyond the rim: to the rim, and one step of Newton's along it. */
+            double c = (v[0] + step[0]) / r, d = (v[1] + step[1]) / r;
+            double gx = g[0] + m[0] * (c - v[0]) + m[1] * (d - v[1]);
+            double gy = g[1] + m[1] * (c - v[0]) + m[2] * (d - v[1]);
+            double slope = -d * gx + c * gy;
+            double bend = -(m[0] * d * d - 2 * m[1] * c * d + m[2] * c * c) + c * gx + d * gy;
+            double turn = bend > 0 ? fmax(-h, fmin(h, slope / bend)) : 0;
+            step[0] = cos(turn) * c - sin(turn) * d - v[0];
+            step[1] = sin(turn) * c + cos(turn) * d - v[1];
+        }
+        double to[2] = {v[0] + step[0], v[1] + step[1]};
+        double across = sqrt(fmax(0, 1 - to[0] * to[0] - to[1] * to[1]));
+        for (int n = 0; n < 3; n++)
+            a->u[n] = to[0] * s->axes[0][n] + to[1] * s->axes[1][n] + across * s->axes[2][n];
+    } else {
+        moved(s, a, step[0], step[1], a->u);
+    }
+    double gain = g[0] * step[0] + g[1] * step[1] +
+                  0.5 * (m[0] * step[0] * step[0] + 2 * m[1] * step[0] * step[1] + m[2] * step[1] * step[1]);
+    a->score = f[0] + fmax(gain, -0.5 * fabs(f[0]));
+    a->mean_q = (double)mean_q[0];
+}
+
+static void refine(const steer *s, enum locagen_measure measure, aim *a)
+{
+    for (size_t n = 0; n < sizeof WIDTHS / sizeof *WIDTHS; n++)
+        refine_once(s, measure, WIDTHS[n] / s->reach, a);
+}
+
+/* The best direction of all. The grid may put lobes in a wrong order that differ by less than it loses
+ * beside a lobe's top: then several are refined. Returns 0 where nothing scores. */
+static int find_best(const steer *s, enum locagen_measure measure, aim *best)
+{
+    int top[MOST_LOBES], lobes = 0;
+    score_grid(s, measure);
+    for (; lobes < MOST_LOBES; lobes++) {
+        top[lobes] = next_on_grid(s, top, lobes);
+        if (top[lobes] < 0 || !(s->scores[top[lobes]] > CLOSE * s->scores[top[0]]))
+            break;
+        aim a;
+        memcpy(a.u, s->grid_u + 3 * top[lobes], sizeof a.u);
+        refine(s, measure, &a);
+        if (lobes == 0 || a.score > best->score)
+            *best = a;
+    }
+    return lobes > 0 && best->score > 0;
+}
+
+/* How R_n is to be had; where it was never learnt, its level from the power across the direction of most
+ * power. */
+static locagen_whitening whitening(steer *s)
+{
+    locagen_whitening how = {.mics = usable_mics(s), .signal_scale = (float)(1 / s->heard)};
+    float count = (float)__builtin_popcount((unsigned)how.mics);
+    s->fine.least = s->coarse.least = LEAST_DENOMINATOR * count;
+    if (s->learnt > 0) {
+        how.noise_scale = (float)(1 / s->learnt);
+        return how;
+    }
+    how.white = 1.0f;
+    s->paths->whiten(s, &how);
+    double total = 0;
+    for (int k = 0; k < s->bins; k++)
+        total += (double)s->fine.planes[k];
+    aim a;
+    double along = find_best(s, MEASURE_POWER, &a) ? a.score : 0;
+    double across = (total - along) / (s->bins * ((double)count - 1));
+    how.white = (float)fmax(fmax(across, WHITE_SHARE * total / s->bins), (double)s->floor);
+    return how;
+}
+
+static double looks(const steer *s)
+{
+    return s->looks * s->heard * s->heard / s->heard_variance;
+}
+
+static void add_null(steer *s, int source, const double u[3])
+{
+    for (int m = 0; m < s->mics; m++) {
+        float *re = s->nulls + 2 * (source * (long)s->mics + m) * s->stride, *im = re + s->stride;
+        double phase = dot(s->offset[m], u), r = cos(s->spectrum.first_bin * phase);
+        double i = sin(s->spectrum.first_bin * phase), step_r = cos(phase), step_i = sin(phase);
+        for (int k = 0; k < s->stride; k++) {
+            re[k] = (float)r, im[k] = (float)i;
+            double turned = r * step_r - i * step_i;
+            i = r * step_i + i * step_r, r = turned;
+        }
+    }
+}
+
+static locagen_source told(const aim *a, double t, int mics)
+{
+    double azimuth[3], elevation[3];
+    arcs(a->u, azimuth, elevation);
+    /* From the coordinates of the refinement, as they were before its last step, to the arcs. */
+    double x[2] = {dot(a->along[0], azimuth), dot(a->along[1], azimuth)};
+    double y[2] = {dot(a->along[0], elevation), dot(a->along[1], elevation)};
+    const double *h = a->hessian;
+    double xx = h[0] * x[0] * x[0] + 2 * h[1] * x[0] * x[1] + h[2] * x[1] * x[1];
+    double xy = h[0] * x[0] * y[0] + h[1] * (x[0] * y[1] + x[1] * y[0]) + h[2] * x[1] * y[1];
+    double yy = h[0] * y[0] * y[0] + 2 * h[1] * y[0] * y[1] + h[2] * y[1] * y[1];
+    double level = hypot(a->u[0], a->u[1]);
+    return (locagen_source){
+        .azimuth_rad = level > 1e-9 ? (float)atan2(a->u[1], a->u[0]) : 0.0f,
+        .elevation_rad = (float)atan2(-a->u[2], level),
+        .score = (float)(t * a->score),
+        .snr = (float)fmax(0, (a->mean_q - 1) / __builtin_popcount((unsigned)mics)),
+        .information = {(float)(-t * xx), (float)(-t * xy), (float)(-t * yy)},
+    };
+}
+
+/* Whether a further source is one that others should make room for: not noise, of which the smoothed bins
+ * alone give about one each; not what an inexact null leaves of the source before. Nulling a direction that
+ * holds no source would cost the others many degrees (measured: up to 16). */
+static int is_sure(const steer *s, const aim *aims, const double *score, int n)
+{
+    int sure = looks(s) * score[n] > 4.0 * s->bins / (2 * s->fine.half + 1) && score[n] > 0.05 * score[0];
+    for (int before = 0; before < n; before++)
+        sure &= !same_lobe(s, aims[n].u, aims[before].u);
+    return sure;
+}
+
+/* Each direction anew with all others nulled, twice round: a source found first was found with the others in
+ * the way (the relaxation of Li & Stoica 1996, "Efficient mixed-spectrum estimation"). */
+static void relax(steer *s, locagen_whitening how, int found, aim *aims)
+{
+    how.nulls = found - 1;
+    for (int step = 0; step < 2 * found; step++) {
+        aim *a = &aims[step % found];
+        for (int other = 0, slot = 0; other < found; other++)
+            if (&aims[other] != a)
+                add_null(s, slot++, aims[other].u);
+        s->paths->whiten(s, &how);
+        refine(s, MEASURE_RATIO, a);
+    }
+}
+
+int locagen_steer_search(locagen_steer *memory, int32_t most, locagen_source *out)
+{
+    if (memory == NULL || out == NULL)
+        return LOCAGEN_E_NULL;
+    if (most < 1)
+        return LOCAGEN_E_COUNT;
+    steer *s = state_of(memory);
+    if (usable_mics(s) == 0)
+        return 0;
+    locagen_whitening how = whitening(s);
+    int count = __builtin_popcount((unsigned)how.mics), found = 0;
+    aim aims[MOST_MICS];
+    double score[MOST_MICS], mean_q[MOST_MICS];
+    for (; found < most && found < count - 1; found++, how.nulls++) {
+        aim *a = &aims[found];
+        s->paths->whiten(s, &how);
+        if (!find_best(s, MEASURE_RATIO, a))
+            break;
+        score[found] = a->score, mean_q[found] = a->mean_q;
+        add_null(s, found, a->u);
+        s->fine.least = s->coarse.least = LEAST_AFTER_NULL * (float)count;
+    }
+    int sure = found > 0;
+    while (sure < found && is_sure(s, aims, score, sure))
+        sure++;
+    if (sure > 1)
+        relax(s, how, sure, aims);
+    for (int n = 0; n < found; n++) {
+        aims[n].score = score[n], aims[n].mean_q = mean_q[n];
+        out[n] = told(&aims[n], looks(s), how.mics);
+    }
+    return found;
+}
+
+int locagen_steer_bin_count(const locagen_steer *memory)
+{
+    return memory == NULL ? LOCAGEN_E_NULL : state_of(memory)->bins;
+}
+
+int locagen_steer_first_bin(const locagen_steer *memory)
+{
+    return memory == NULL ? LOCAGEN_E_NULL : state_of(memory)->spectrum.first_bin;
+}
+
+int locagen_steer_bins(const locagen_steer *memory, float *bins)
+{
+    if (memory == NULL || bins == NULL)
+        return LOCAGEN_E_NULL;
+    const steer *s = state_of(memory);
+    for (int m = 0; m < s->mics; m++)
+        for (int k = 0; k < s->bins; k++) {
+            *bins++ = s->bins_re[m * (long)s->stride + k];
+            *bins++ = s->bins_im[m * (long)s->stride + k];
+        }
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_noise(const locagen_steer *memory, float *noise)
+{
+    if (memory == NULL || noise == NULL)
+        return LOCAGEN_E_NULL;
+    const steer *s = state_of(memory);
+    float scale = s->learnt > 0 ? (float)(1 / s->learnt) : 0.0f;
+    for (int k = 0; k < s->bins; k++, noise += 2 * s->mics * s->mics) {
+        const float *pair = s->noise + s->mics * (long)s->stride + k;
+        for (int i = 0; i < s->mics; i++) {
+            float *own = noise + 2 * (i * s->mics + i);
+            own[0] = scale * s->noise[i * (long)s->stride + k], own[1] = 0.0f;
+            for (int j = i + 1; j < s->mics; j++, pair += 2 * (long)s->stride) {
+                float *upper = noise + 2 * (i * s->mics + j), *lower = noise + 2 * (j * s->mics + i);
+                upper[0] = lower[0] = scale * pair[0];
+                upper[1] = scale * pair[s->stride], lower[1] = -upper[1];
+            }
+        }
+    }
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_axes(const locagen_steer *memory, float *elevation, float *azimuth)
+{
+    if (memory == NULL || elevation == NULL || azimuth == NULL)
+        return LOCAGEN_E_NULL;
+    const steer *s = state_of(memory);
+    for (int row = 0; row < s->elevations; row++)
+        elevation[row] = (float)grid_elevation(s, row);
+    for (int column = 0; column < s->azimuths; column++)
+        azimuth[column] = (float)grid_azimuth(s, column);
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_map(locagen_steer *memory, float *map)
+{
+    if (memory == NULL || map == NULL)
+        return LOCAGEN_E_NULL;
+    steer *s = state_of(memory);
+    int count = s->azimuths * s->elevations;
+    if (usable_mics(s) == 0) {
+        memset(map, 0, (size_t)count * sizeof *map);
+        return LOCAGEN_OK;
+    }
+    locagen_whitening how = whitening(s);
+    s->paths->whiten(s, &how);
+    score_grid(s, MEASURE_RATIO);
+    for (int n = 0; n < count; n++)
+        map[n] = (float)looks(s) * s->scores[n];
+    return LOCAGEN_OK;
+}
