@@ -92,7 +92,7 @@ def _heard(path: Path, s: LabSettings, labels: list[Label]) -> Iterator[tuple[La
 
 def _row(label: Label, estimate: Estimate, fix: Any) -> dict[str, Any]:
     found, track = estimate.bearing.azimuth_rad, estimate.track
-    known = fix is not None and fix.range_observable
+    known = fix is not None and bool(fix.range_observable)
     return {
         "label": label.place,
         "file": label.file,
@@ -158,7 +158,7 @@ def _swept(s: LabSettings, snr_db: float, range_m: float | None) -> tuple[F64, F
         found = estimate(tdoa).azimuth_rad
         off.append(90.0 if found is None else abs(math.degrees(wrap(found - float(true)))))
         fix = locate(tdoa).fix if range_m is not None else None
-        known = fix is not None and fix.range_observable
+        known = fix is not None and bool(fix.range_observable)
         off_m.append(abs(fix.range_m - here.twin.range_m) if fix is not None and known else math.nan)
     return np.degrees(drawn["azimuth_rad"].astype(np.float64)) % 360.0, np.array(off), np.array(off_m)
 
