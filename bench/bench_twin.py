@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--sound-s", type=float, default=30.0, help="sound per repeat and scene")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="only show that it works")
-    parser.add_argument("--output", type=Path, default=report.RESULTS / "twin.json")
+    parser.add_argument("--output", type=Path, default=report.default("twin"))
     arguments = parser.parse_args()
     samples, sound_s, repeats = (
         (20_000, 0.5, 2) if arguments.quick else (arguments.samples, arguments.sound_s, arguments.repeats)
