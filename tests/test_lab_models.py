@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 
@@ -143,6 +144,26 @@ def test_exported_models_say_what_the_trained_ones_say(name, rounding) -> None:
     off *= np.minimum(np.hypot(*answers.T), 1.0)  # to the error of the components, which an angle magnifies
     # equally good angles of a median may be told apart by the last bit: its grid is 0.25 degrees
     assert off.max() < (0.009 if name.endswith("median") else 1e-5)
+
+
+def test_trees_decide_alike_right_on_their_thresholds() -> None:
+    """scikit-learn's are double precision, ONNX's single: the next numbers on both sides go the same ways."""
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((2_000, 3)).astype(np.float32)
+    forest = Forest(SMALL.forest, 12).fit(x, rng.uniform(-3.0, 3.0, 2_000).astype(np.float32))
+    rows = []
+    for tree in (fitted.tree_ for fitted in forest._model.estimators_):
+        for node in np.flatnonzero(tree.feature >= 0)[:60]:
+            at = np.float32(tree.threshold[node])
+            for value in (at, np.nextafter(at, np.float32(9)), np.nextafter(at, np.float32(-9))):
+                row = x[len(rows)].copy()
+                row[tree.feature[node]] = value
+                rows.append(row)
+    seen = np.array(rows)
+    content = forest._trees(3).SerializeToString()
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    found = np.concatenate([session.run(None, {"features": row[None]})[1] for row in seen])
+    np.testing.assert_allclose(found, forest._model.predict_proba(seen), atol=1e-5)
 
 
 def test_installed_model_flies_by_its_name(tmp_path) -> None:
