@@ -108,10 +108,15 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(BIN)/python bench/bench_steered.py
 	$(BIN)/python bench/bench_pipeline.py
 	$(BIN)/python bench/bench_accuracy.py --trials 100
+	$(BIN)/python bench/bench_twin.py
 
 .PHONY: models
 models: $(VENV)/.dev ## trains the models anew
-	$(BIN)/python -m locagen_edge.lab.train
+	$(BIN)/locagen-lab train --settings models/tdoa-mlp.toml --name tdoa-mlp --models models --out build/tdoa-mlp
+
+.PHONY: paper
+paper: $(VENV)/.dev ## repeats the paper's experiments, into paper-report/ (some minutes)
+	$(BIN)/locagen-lab paper --out paper-report
 
 # --- the service
 

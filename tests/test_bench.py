@@ -57,3 +57,11 @@ def test_accuracy(tmp_path):
     judged = [name for name in cell if name.startswith("pyroomacoustics")]
     assert len(judged) + len(report["missing"]) == 4
     assert cell["far-field"]["mean_deg"] < 1.5
+
+
+def test_twin(tmp_path):
+    found = run("bench_twin.py", tmp_path)
+    assert {"default", "sweep"} <= found["arrivals_per_s"].keys()
+    assert {"plain, 1 s", "four rotors", "plain, a frame, features"} <= found["times_real_time"].keys()
+    for values in (*found["arrivals_per_s"].values(), *found["times_real_time"].values()):
+        assert 0 < values["min"] <= values["median"] <= values["p99"]

@@ -48,7 +48,16 @@ def command(folder, settings, *more):
     """The command line that makes this data set."""
     file = folder.parent / "lab.toml"
     file.write_text(sample(settings))
-    return [sys.executable, "-m", "locagen_edge.lab.dataset", str(folder), "--settings", str(file), *more]
+    return [
+        sys.executable,
+        "-m",
+        "locagen_edge.lab.cli",
+        "dataset",
+        str(folder),
+        "--settings",
+        str(file),
+        *more,
+    ]
 
 
 def environment():
@@ -434,11 +443,11 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path):
 
 def test_impossible_parameters_are_refused_all_at_once(tmp_path):
     code, _, errors = run([
-        sys.executable, "-m", "locagen_edge.lab.dataset", str(tmp_path / "set"),
+        sys.executable, "-m", "locagen_edge.lab.cli", "dataset", str(tmp_path / "set"),
         "--samples", "0", "--shard-size", "-5", "--level", "dreams",
     ])  # fmt: skip
     assert code == 1
-    assert {line.partition(":")[0] for line in errors.splitlines()} == {
+    assert {line.split(": ")[1] for line in errors.splitlines()} == {
         "data.samples", "dataset.shard", "dataset.level"
     }  # fmt: skip
     assert not (tmp_path / "set").exists()

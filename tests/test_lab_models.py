@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 
 import numpy as np
@@ -14,9 +13,9 @@ import torch
 from locagen_edge.errors import ModelError
 from locagen_edge.geometry import direction
 from locagen_edge.lab.bound import best_table, look_up, mae_deg
+from locagen_edge.lab.export import answers_of, install
 from locagen_edge.lab.features import Features, normalised
 from locagen_edge.lab.forest import Forest
-from locagen_edge.lab.install import install_method
 from locagen_edge.lab.methods import METHODS, split, take, train
 from locagen_edge.lab.nets.siren import siren
 from locagen_edge.lab.settings import LabSettings
@@ -137,9 +136,8 @@ def test_exported_models_say_what_the_trained_ones_say(name, rounding) -> None:
     s = with_twin(SMALL, rounding=rounding)
     learned, test = sample(s, 2_000, 1), sample(s, 100, 2)
     trained = train(name, s, learned)
-    session = onnxruntime.InferenceSession(trained.onnx(), providers=["CPUExecutionProvider"])
     x = normalised(test.delay_s, s.mic_array, s.speed_m_s)
-    answers = np.concatenate([session.run(None, {"delays": row[None]})[0] for row in x])
+    answers = answers_of(trained.onnx(), x)
     assert answers.shape == (100, 2)
     found = np.arctan2(answers[:, 1], answers[:, 0].astype(np.float64))
     off = np.abs(np.angle(np.exp(1j * (found - trained.azimuths(test.delay_s)))))
@@ -148,13 +146,30 @@ def test_exported_models_say_what_the_trained_ones_say(name, rounding) -> None:
     assert off.max() < (0.009 if name.endswith("median") else 1e-5)
 
 
+def test_trees_decide_alike_right_on_their_thresholds() -> None:
+    """scikit-learn's are double precision, ONNX's single: the next numbers on both sides go the same ways."""
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((2_000, 3)).astype(np.float32)
+    forest = Forest(SMALL.forest, 12).fit(x, rng.uniform(-3.0, 3.0, 2_000).astype(np.float32))
+    rows = []
+    for tree in (fitted.tree_ for fitted in forest._model.estimators_):
+        for node in np.flatnonzero(tree.feature >= 0)[:60]:
+            at = np.float32(tree.threshold[node])
+            for value in (at, np.nextafter(at, np.float32(9)), np.nextafter(at, np.float32(-9))):
+                row = x[len(rows)].copy()
+                row[tree.feature[node]] = value
+                rows.append(row)
+    seen = np.array(rows)
+    content = forest._trees(3).SerializeToString()
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    found = np.concatenate([session.run(None, {"features": row[None]})[1] for row in seen])
+    np.testing.assert_allclose(found, forest._model.predict_proba(seen), atol=1e-5)
+
+
 def test_installed_model_flies_by_its_name(tmp_path) -> None:
-    for name in ("mlp", "forest"):
-        line = install_method(name, LabSettings() if name == "forest" else SMALL, tmp_path)
-        assert name in line
-    manifest = json.loads((tmp_path / "manifest.json").read_text())["models"]
-    assert set(manifest) == {"mlp", "forest"}
-    assert "c (t_j - t_i) / d_ij" in (tmp_path / "forest.md").read_text()
+    s = LabSettings()
+    learned, _ = split(sample(s, s.data.samples, 1), s.data.train_share)
+    install("forest", train("forest", s, learned).onnx(), s.mic_array.positions_m, "# forest\n", tmp_path)
     s = dataclasses.replace(
         LabSettings(),
         models=dataclasses.replace(LabSettings().models, directory=str(tmp_path)),
@@ -170,9 +185,9 @@ def test_installed_model_flies_by_its_name(tmp_path) -> None:
     assert math.degrees(np.mean(off)) < 8.0  # 6.7 and three standard errors of 200 samples
 
 
-def test_an_unknown_method_is_refused_with_the_names_of_all(tmp_path) -> None:
+def test_an_unknown_method_is_refused_with_the_names_of_all() -> None:
     with pytest.raises(ModelError, match="forest-24-mean"):
-        install_method("oracle", SMALL, tmp_path)
+        train("oracle", SMALL, sample(SMALL, 100, 1))
 
 
 # --- methods that learn nothing -----------------------------------------------------------------------

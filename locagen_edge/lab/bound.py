@@ -112,11 +112,28 @@ def cramer_rao_deg(
 ) -> float:
     """The smallest mean |azimuth error| in degrees of a far source on the horizon, by Cramer and Rao.
 
-    J = sum_m (tau'_m - mean)^2 / sigma^2, with tau'_m the change of an arrival with the azimuth and sigma
-    that of `arrival_sigma_s`; a Gaussian error of variance 1 / J has the mean sqrt(2 / (pi J)).
+    With the sigma of `arrival_sigma_s`; see `expected_deg`.
     """
-    across = np.array([-math.sin(azimuth_rad), math.cos(azimuth_rad), 0.0])
-    slope = -(array.positions_m @ across) / speed_m_s
     sigma = arrival_sigma_s(snr_db, band_hz, seconds, array.mics)
-    information = float(((slope - slope.mean()) ** 2).sum()) / sigma**2
-    return math.degrees(math.sqrt(2.0 / (math.pi * information)))
+    return float(expected_deg(array, speed_m_s, np.array([azimuth_rad]), np.zeros(1), sigma)[0])
+
+
+def expected_deg(
+    array: MicArray, speed_m_s: float, azimuth_rad: F64, elevation_rad: F64, sigma_s: float | F64
+) -> F64:
+    """The smallest mean |azimuth error| (n,) in degrees of far sources whose arrivals are off by sigma_s.
+
+    J = sum_m (tau'_m - mean)^2 / sigma^2, with tau'_m the change of an arrival with the azimuth, which
+    shrinks with the elevation's cosine; a Gaussian error of variance 1 / J has the mean sqrt(2 / (pi J)).
+    """
+    across = np.stack([-np.sin(azimuth_rad), np.cos(azimuth_rad), np.zeros_like(azimuth_rad)])
+    slope = -(array.positions_m @ (across * np.cos(elevation_rad))) / speed_m_s
+    spread = ((slope - slope.mean(axis=0)) ** 2).sum(axis=0)
+    mean: F64 = np.degrees(sigma_s * np.sqrt(2.0 / (math.pi * np.maximum(spread, 1e-30))))
+    return mean
+
+
+def displacement_sigma_s(position_error_m: float, speed_m_s: float, elevation_rad: F64) -> F64:
+    """1-sigma of an arrival (n,) at a microphone that is off by up to this along x and y, uniform."""
+    sigma: F64 = position_error_m / math.sqrt(3.0) * np.cos(elevation_rad) / speed_m_s
+    return sigma

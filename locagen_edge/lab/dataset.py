@@ -6,7 +6,7 @@ kept, after their metadata have been found to agree; a folder of other settings 
 
 On a cluster the workers write, so the folder has to be on a file system that all of them share.
 
-    python -m locagen_edge.lab.dataset FOLDER --level waveforms --samples 100000 --workers 4
+    locagen-lab dataset FOLDER --level waveforms --samples 100000 --workers 4
 """
 
 from __future__ import annotations
@@ -266,9 +266,3 @@ def open_dataset(folder: Path, settings: LabSettings) -> Dataset:
             "the command that made the others goes on from there"
         )
     return Dataset(paths, sum(int(one["samples"]) for one in told))
-
-
-if __name__ == "__main__":
-    from locagen_edge.lab.dataset_cli import main
-
-    main()

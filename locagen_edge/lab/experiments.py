@@ -11,7 +11,7 @@ import dataclasses
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from locagen_edge.lab.bound import best_table, errors_rad, look_up
 from locagen_edge.lab.export import install
 from locagen_edge.lab.methods import METHODS, split, take, train
 from locagen_edge.lab.settings import LabSettings
+from locagen_edge.lab.sound import HELD_OUT, from_waveforms
 from locagen_edge.lab.triangulation import Azimuths, fixed_start, flight, least_squares, over_cells
 from locagen_edge.lab.twin import at_rate, sample, with_spacing, with_twin
 from locagen_edge.sim.arrivals import Arrivals
@@ -35,7 +36,6 @@ PAPER: dict[str, Any] = {
         "10000": {"forest-12": 13.16, "forest-24": 14.36, "mlp": 13.38, "siren": 90.0},
         "48000": {"mlp": 2.87},
     },
-    "mlp_after_fft_filter_deg": 13.37,
     "less_than_triangulation": 0.67,
     "distinct_angles": 12,
     "offset_p": [0.266, 0.185],
@@ -94,14 +94,19 @@ def reduced(s: LabSettings, scale: Scale) -> LabSettings:
     )
 
 
-def run(s: LabSettings, scale: Scale, step: Callable[[str], None]) -> dict[str, Any]:
-    """All experiments; `step` is told the name of each before it begins. The result is ready for JSON."""
+def run(
+    s: LabSettings, scale: Scale, step: Callable[[str], None], names: Collection[str] = ()
+) -> dict[str, Any]:
+    """The experiments of these names, none: all; `step` is told the name of each before it begins.
+
+    The result is ready for JSON.
+    """
     s = reduced(s, scale)
     result: dict[str, Any] = {"paper": PAPER, "setup": setup(s, scale)}
-    for name, function in EXPERIMENTS.items():
+    for name in names or EXPERIMENTS:
         step(name)
         begin = time.perf_counter()
-        result[name] = function(s, scale)
+        result[name] = EXPERIMENTS[name](s, scale)
         result["setup"]["seconds"][name] = round(time.perf_counter() - begin, 1)
     return result
 
@@ -410,6 +415,7 @@ def distinct_angles(s: LabSettings, data: Arrivals) -> int:
 
 EXPERIMENTS: dict[str, Callable[[LabSettings, Scale], dict[str, Any]]] = {
     "by_rate": by_rate,
+    "waveforms": lambda s, scale: from_waveforms(s, s.data.samples, min(HELD_OUT, scale.held_out // 10)),
     "by_spacing": by_spacing,
     "distribution": distribution,
     "offsets": offsets,

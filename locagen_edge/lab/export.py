@@ -9,16 +9,18 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 import torch
 
+from locagen_edge.lab.files import write
 from locagen_edge.models import MANIFEST
+from locagen_edge.types import F32
 
 OPSET = 18
 TYPES = {onnx.TensorProto.FLOAT: "tensor(float)"}
@@ -63,9 +65,17 @@ def install(name: str, content: bytes, positions_m: np.ndarray, card: str, direc
         "array_m": np.round(positions_m, 6).tolist(),
         "card": f"{name}.md",
     }
-    _write(directory / f"{name}.onnx", content)
-    _write(directory / f"{name}.md", card.encode())
-    _write(path, (json.dumps(manifest, indent=2) + "\n").encode())
+    write(directory / f"{name}.onnx", content)
+    write(directory / f"{name}.md", card)
+    write(path, json.dumps(manifest, indent=2) + "\n")
+
+
+def answers_of(content: bytes, x: F32) -> F32:
+    """What the file answers (n, outputs) to inputs (n, ...), one by one as in flight."""
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    (given,) = session.get_inputs()
+    answers: F32 = np.concatenate([session.run(None, {given.name: row[None]})[0] for row in x])
+    return answers
 
 
 def _tensor(value: Any) -> dict[str, Any]:
@@ -75,9 +85,3 @@ def _tensor(value: Any) -> dict[str, Any]:
         "type": TYPES[tensor.elem_type],
         "shape": [d.dim_value for d in tensor.shape.dim],
     }
-
-
-def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,13 @@ import torch
 
 from locagen_edge.lab.settings import MlpSettings, SirenSettings
 from locagen_edge.types import F32, F64
+
+Tell = Callable[[int, int, float], None]
+"""told after each pass: its number from 1, how many there are at most, mean |error| on validation samples"""
+
+
+def quiet(_: int, __: int, ___: float) -> None:
+    """Tells nobody."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,26 +36,37 @@ def fit(
     azimuth_rad: F32,
     s: MlpSettings | SirenSettings,
     validation_share: float,
+    tell: Tell = quiet,
 ) -> History:
     """Trains the model in place on inputs (n, ...) and azimuths (n,); leaves the best pass's weights in it.
 
     The loss is the squared error of cosine and sine, whose best answer for an input is the mean direction
     of all azimuths that lead to it. The last `validation_share` of the samples are not trained on: the pass
     with the smallest mean |error| there counts, and `s.patience` passes without a better one end it.
+    Where there is CUDA, it trains there.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # layers this small take longer on two threads than on one
     try:
-        return _fit(model, x, azimuth_rad, s, max(int(len(x) * validation_share), 1))
+        return _fit(model, x, azimuth_rad, s, max(int(len(x) * validation_share), 1), tell)
     finally:
+        model.cpu()
         torch.set_num_threads(threads)
 
 
 def _fit(
-    model: torch.nn.Module, x: F32, azimuth_rad: F32, s: MlpSettings | SirenSettings, held: int
+    model: torch.nn.Module,
+    x: F32,
+    azimuth_rad: F32,
+    s: MlpSettings | SirenSettings,
+    held: int,
+    tell: Tell,
 ) -> History:
-    inputs, held_inputs = torch.from_numpy(x[:-held]), torch.from_numpy(x[-held:])
-    wanted = torch.from_numpy(np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=1).astype(np.float32))
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    model.to(device)
+    inputs = torch.from_numpy(x[:-held]).to(device)
+    directions = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=1).astype(np.float32)
+    wanted = torch.from_numpy(directions).to(device)
     generator = torch.Generator().manual_seed(s.seed)
     steps = math.ceil(len(inputs) / s.batch)
     optimiser = torch.optim.AdamW(model.parameters(), lr=s.rate)
@@ -56,15 +75,16 @@ def _fit(
     history: list[float] = []
     for epoch in range(s.epochs):
         model.train()
-        order = torch.randperm(len(inputs), generator=generator)
+        order = torch.randperm(len(inputs), generator=generator).to(device)
         for rows in torch.split(order, s.batch):
             loss = torch.nn.functional.mse_loss(model(inputs[rows]), wanted[rows])
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
             schedule.step()
-        error = np.abs(_turn(predict(model, held_inputs.numpy()) - azimuth_rad[-held:]))
+        error = np.abs(_turn(predict(model, x[-held:]) - azimuth_rad[-held:]))
         history.append(math.degrees(float(error.mean())))
+        tell(epoch + 1, s.epochs, history[-1])
         if history[-1] < best:
             best, best_epoch, weights = history[-1], epoch, copy.deepcopy(model.state_dict())
         elif epoch - best_epoch >= s.patience:
@@ -76,8 +96,9 @@ def _fit(
 def predict(model: torch.nn.Module, x: F32) -> F64:
     """Azimuths (n,) for inputs (n, ...), radians."""
     model.eval()
+    device = next(model.parameters()).device
     with torch.no_grad():
-        y = model(torch.from_numpy(x)).numpy().astype(np.float64)
+        y = model(torch.from_numpy(x).to(device)).cpu().numpy().astype(np.float64)
     azimuth: F64 = np.arctan2(y[:, 1], y[:, 0])
     return azimuth
 

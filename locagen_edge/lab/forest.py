@@ -6,9 +6,9 @@ A classifier gives the probability of each bin, and its mean error depends on ho
     mean     the mean direction of all bins, each with its probability
     median   the angle of smallest mean |error|, each bin's probability spread evenly over it
 
-The ONNX file is written here, tree by tree. scikit-learn compares single-precision features with thresholds
-in double precision; a threshold rounded down to single precision decides alike for every feature, where one
-rounded to nearest, as converters do it, sends some to the other side.
+The ONNX file is the features' graph, skl2onnx's trees and the reading, joined. scikit-learn compares
+single-precision features with thresholds in double precision; skl2onnx moves each threshold to the single
+precision number that decides alike, so trees answer the same even for features right on a threshold.
 """
 
 from __future__ import annotations
@@ -18,14 +18,17 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, compose, helper, numpy_helper
+from skl2onnx import convert_sklearn
+from skl2onnx.common.data_types import FloatTensorType
 from sklearn.ensemble import RandomForestClassifier, RandomForestRegressor
 
-from locagen_edge.lab.export import to_onnx
+from locagen_edge.lab.export import OPSET, to_onnx
 from locagen_edge.lab.features import Features
 from locagen_edge.lab.settings import ForestSettings
 from locagen_edge.types import F32, F64
 
+OPSETS = {"": OPSET, "ai.onnx.ml": 1}
 READINGS = ("centre", "mean", "median")
 CANDIDATES = 1440
 """Angles among which the median is looked for: a quarter of a degree apart, 0.06 degrees of error at most."""
@@ -103,38 +106,55 @@ class Forest:
 
     def to_onnx(self, features: Features, pairs: int) -> bytes:
         """Normalised delays (1, pairs) to cosine and sine (1, 2)."""
-        model = onnx.load_model_from_string(to_onnx(features, torch.zeros(1, pairs), "delays", "features"))
-        graph, last = model.graph, model.graph.output[0].name
-        values = [_leaf_values(tree, self.bins) for tree in self._model.estimators_]
-        if self.bins and self.reading == "mean":
-            values = [value @ _directions(self._centres) for value in values]
-        graph.node.append(_ensemble(self._model.estimators_, values, last, "values"))
+        seen = onnx.load_model_from_string(to_onnx(features, torch.zeros(1, pairs), "delays", "features"))
+        trees = self._trees(features.size)
+        trees.ir_version = seen.ir_version
+        io_map = [(seen.graph.output[0].name, trees.graph.input[0].name)]
+        model = compose.merge_models(seen, trees, io_map, prefix2="forest_")
+        graph = model.graph
+        values = graph.output[-1].name
+        reading = self.reading if self.bins else "regression"
         steps: dict[str, list[onnx.NodeProto]] = {
-            "mean": [helper.make_node("Identity", ["values"], ["direction"])],
+            "regression": [helper.make_node("Identity", [values], ["direction"])],
+            "mean": [helper.make_node("MatMul", [values, "directions"], ["direction"])],
             "centre": [
-                helper.make_node("ArgMax", ["values"], ["at"], axis=1, keepdims=0),
+                helper.make_node("ArgMax", [values], ["at"], axis=1, keepdims=0),
                 helper.make_node("Gather", ["directions", "at"], ["direction"], axis=0),
             ],
             "median": [
-                helper.make_node("MatMul", ["values", "cost"], ["costs"]),
+                helper.make_node("MatMul", [values, "cost"], ["costs"]),
                 helper.make_node("ArgMin", ["costs"], ["at"], axis=1, keepdims=0),
                 helper.make_node("Gather", ["directions", "at"], ["direction"], axis=0),
             ],
         }
-        reading = self.reading if self.bins else "mean"
         graph.node.extend(steps[reading])
         if reading == "median":
             graph.initializer.append(numpy_helper.from_array(self._cost().astype(np.float32), "cost"))
-        if reading != "mean":
-            angles = self._centres if reading == "centre" else _candidates()
+        if reading != "regression":
+            angles = _candidates() if reading == "median" else self._centres
             table = _directions(angles).astype(np.float32)
             graph.initializer.append(numpy_helper.from_array(table, "directions"))
         del graph.output[:]
         graph.output.append(helper.make_tensor_value_info("direction", TensorProto.FLOAT, [1, 2]))
-        model.opset_import.append(helper.make_opsetid("ai.onnx.ml", 3))
+        del model.opset_import[:]
+        model.opset_import.extend(helper.make_opsetid(*opset) for opset in OPSETS.items())
         onnx.checker.check_model(model, full_check=True)
         content: bytes = model.SerializeToString(deterministic=True)
         return content
+
+    def _trees(self, inputs: int) -> onnx.ModelProto:
+        """The forest alone: features (1, inputs) to probabilities (1, bins) or directions (1, 2)."""
+        model: onnx.ModelProto = convert_sklearn(
+            self._model,
+            name="forest",  # else one drawn at random: same trees, same bytes
+            initial_types=[("features", FloatTensorType([1, inputs]))],
+            options={"zipmap": False} if self.bins else None,
+            target_opset=OPSETS,
+        )
+        outputs = len(self._model.classes_) if self.bins else 2
+        last = model.graph.output[-1]  # of a regression with two targets it is stated to have one
+        last.CopyFrom(helper.make_tensor_value_info(last.name, TensorProto.FLOAT, [1, outputs]))
+        return model
 
 
 def _directions(azimuth_rad: F64) -> F64:
@@ -143,59 +163,3 @@ def _directions(azimuth_rad: F64) -> F64:
 
 def _candidates() -> F64:
     return np.arange(CANDIDATES, dtype=np.float64) * (2.0 * np.pi / CANDIDATES)
-
-
-def _leaf_values(tree: Any, bins: int) -> F64:
-    """(nodes, outputs) what each node of a fitted tree would answer."""
-    value = tree.tree_.value
-    counts: F64 = value[:, 0, :] if bins else value[:, :, 0]
-    return counts / counts.sum(axis=1, keepdims=True) if bins else counts
-
-
-def _ensemble(trees: list[Any], values: list[F64], source: str, target: str) -> onnx.NodeProto:
-    """The mean of all trees as one node: arrays over all nodes of all trees."""
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("tree", "node", "mode", "feature", "at")}
-    parts |= {name: [] for name in ("yes", "no", "leaf_tree", "leaf_node", "leaf_output", "leaf_value")}
-    for number, (fitted, value) in enumerate(zip(trees, values, strict=True)):
-        tree = fitted.tree_
-        leaf = tree.children_left < 0
-        parts["tree"].append(np.full(tree.node_count, number))
-        parts["node"].append(np.arange(tree.node_count))
-        parts["mode"].append(leaf)
-        parts["feature"].append(np.where(leaf, 0, tree.feature))
-        parts["at"].append(np.where(leaf, 0.0, _rounded_down(tree.threshold)))
-        parts["yes"].append(np.where(leaf, 0, tree.children_left))
-        parts["no"].append(np.where(leaf, 0, tree.children_right))
-        (where,) = leaf.nonzero()
-        outputs = value.shape[1]
-        parts["leaf_tree"].append(np.full(len(where) * outputs, number))
-        parts["leaf_node"].append(np.repeat(where, outputs))
-        parts["leaf_output"].append(np.tile(np.arange(outputs), len(where)))
-        parts["leaf_value"].append((value[where] / len(trees)).ravel())
-    flat = {name: np.concatenate(arrays).tolist() for name, arrays in parts.items()}
-    return helper.make_node(
-        "TreeEnsembleRegressor",
-        [source],
-        [target],
-        domain="ai.onnx.ml",
-        n_targets=values[0].shape[1],
-        aggregate_function="SUM",
-        nodes_treeids=flat["tree"],
-        nodes_nodeids=flat["node"],
-        nodes_modes=["LEAF" if leaf else "BRANCH_LEQ" for leaf in flat["mode"]],
-        nodes_featureids=flat["feature"],
-        nodes_values=flat["at"],
-        nodes_truenodeids=flat["yes"],
-        nodes_falsenodeids=flat["no"],
-        target_treeids=flat["leaf_tree"],
-        target_nodeids=flat["leaf_node"],
-        target_ids=flat["leaf_output"],
-        target_weights=flat["leaf_value"],
-    )
-
-
-def _rounded_down(threshold: F64) -> F32:
-    """The largest single-precision number not above each threshold."""
-    single = threshold.astype(np.float32)
-    above = single > threshold
-    return np.where(above, np.nextafter(single, np.float32(-np.inf)), single).astype(np.float32)

@@ -12,9 +12,10 @@ from typing import Any
 
 import torch
 
+from locagen_edge.errors import ModelError
 from locagen_edge.lab.export import to_onnx
 from locagen_edge.lab.features import fit_features, normalised
-from locagen_edge.lab.fit import History, fit, predict
+from locagen_edge.lab.fit import History, Tell, fit, predict, quiet
 from locagen_edge.lab.forest import Forest
 from locagen_edge.lab.nets.mlp import mlp
 from locagen_edge.lab.nets.siren import siren
@@ -32,13 +33,15 @@ class Trained:
     onnx: Callable[[], bytes]
     """the model file: normalised delays of all pairs (1, pairs) to cosine and sine (1, 2)"""
     history: History | None = None
+    ties: bool = False
+    """whether two angles may be equally good answers, which the last bit tells apart"""
 
 
-Maker = Callable[[LabSettings, Arrivals], Trained]
+Maker = Callable[[LabSettings, Arrivals, Tell], Trained]
 
 
 def _forest(bins: int, reading: str) -> Maker:
-    def make(s: LabSettings, data: Arrivals) -> Trained:
+    def make(s: LabSettings, data: Arrivals, _: Tell) -> Trained:
         array = s.mic_array
         x = normalised(data.delay_s, array, s.speed_m_s)
         features = fit_features(x, array.mics)
@@ -47,7 +50,9 @@ def _forest(bins: int, reading: str) -> Maker:
         def azimuths(delay_s: F32) -> F64:
             return forest.predict(apply(features, normalised(delay_s, array, s.speed_m_s)))
 
-        return Trained(azimuths, lambda: forest.to_onnx(features, len(array.pairs)))
+        return Trained(
+            azimuths, lambda: forest.to_onnx(features, len(array.pairs)), ties=reading in ("median", "centre")
+        )
 
     return make
 
@@ -60,14 +65,14 @@ def _network(
 ) -> Maker:
     """`keys` are set in the section whatever the settings say."""
 
-    def make(s: LabSettings, data: Arrivals) -> Trained:
+    def make(s: LabSettings, data: Arrivals, tell: Tell) -> Trained:
         array, own = s.mic_array, replace(getattr(s, section), **keys)
         x = normalised(data.delay_s, array, s.speed_m_s)
         features = features_of(x, array.mics)
         torch.manual_seed(own.seed)
         seen = apply(features, x)
         model = net(seen.shape[1], own)
-        history = fit(model, seen, data.azimuth_rad, own, s.data.validation_share)
+        history = fit(model, seen, data.azimuth_rad, own, s.data.validation_share, tell)
         whole = torch.nn.Sequential(features, model)
 
         def azimuths(delay_s: F32) -> F64:
@@ -101,6 +106,10 @@ class Seconds(torch.nn.Module):
         return delays[:, : self.base] * self.scale
 
 
+def _as_they_are(_: F32, __: int) -> torch.nn.Module:
+    return torch.nn.Identity()
+
+
 def _in_seconds(_: F32, mics: int) -> torch.nn.Module:
     return Seconds(mics, 0.1 / 343.0)  # a share of 1 is the longest delay of 10 cm
 
@@ -114,17 +123,22 @@ METHODS: dict[str, Maker] = {
     "forest-24-median": _forest(24, "median"),
     "forest": _forest(0, "mean"),
     "mlp": _network(mlp, "mlp"),
+    "mlp-pairs": _network(mlp, "mlp", _as_they_are),
     "siren": _network(siren, "siren"),
     "siren-unscaled": _network(
         siren, "siren", _in_seconds, omega=1.0, omega_hidden=1.0, rate=1e-4, epochs=20
     ),
 }
-"""The paper's, and beside its classifiers the forest that regresses cosine and sine."""
+"""The paper's; beside its classifiers the forest that regresses cosine and sine, and beside its MLP the one
+on the delays of all pairs as they are: the ratio goes through infinity at two azimuths, which whole-sample
+delays never meet and sub-sample ones do."""
 
 
-def train(name: str, s: LabSettings, data: Arrivals) -> Trained:
-    """The method of this name, trained. Raises `KeyError` for a name that is not in the table."""
-    return METHODS[name](s, data)
+def train(name: str, s: LabSettings, data: Arrivals, tell: Tell = quiet) -> Trained:
+    """The method of this name, trained. Raises `ModelError` for a name that is not in the table."""
+    if name not in METHODS:
+        raise ModelError(f"method {name}: is unknown; there are {', '.join(METHODS)}")
+    return METHODS[name](s, data, tell)
 
 
 def take(data: Arrivals, rows: Any) -> Arrivals:

@@ -14,6 +14,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
+from locagen_edge.lab.files import replacing
+
+Drawing = Callable[[Axes, dict[str, Any]], None]
+
 STYLES: dict[str, dict[str, Any]] = {
     "best possible": {"color": "black", "linestyle": "-", "linewidth": 4.0, "alpha": 0.3},
     "least squares": {"color": "tab:blue", "marker": "o"},
@@ -38,6 +42,7 @@ LABELS = {
     "forest-24-median": "forest, 24 bins, median",
     "forest": "forest, regression",
     "mlp": "MLP",
+    "mlp-pairs": "MLP on all pairs, no ratio",
     "siren": "SIREN",
     "siren-unscaled": "SIREN, inputs unscaled",
 }
@@ -55,13 +60,24 @@ PAPER: dict[str, Any] = {
 
 
 def draw_all(result: dict[str, Any], folder: Path) -> None:
-    """Writes every figure as NAME.png."""
+    """Writes the figure of every experiment in the result as NAME.png."""
+    for name, (experiment, function, size) in FIGURES.items():
+        if experiment in result:
+            draw(folder / f"{name}.png", _of(function, result), size)
+
+
+def _of(function: Drawing, result: dict[str, Any]) -> Callable[[Axes], None]:
+    return lambda axes: function(axes, result)
+
+
+def draw(path: Path, function: Callable[[Axes], None], size: tuple[float, float]) -> None:
+    """Writes one figure of this size in inches."""
     with matplotlib.rc_context({"figure.dpi": 120, "font.size": 9, "axes.grid": True, "grid.alpha": 0.3}):
-        for name, (function, size) in FIGURES.items():
-            figure, axes = plt.subplots(figsize=size, layout="constrained")
-            function(axes, result)
-            figure.savefig(folder / f"{name}.png", metadata={"Software": None})
-            plt.close(figure)
+        figure, axes = plt.subplots(figsize=size, layout="constrained")
+        function(axes)
+        with replacing(path) as temporary:
+            figure.savefig(temporary, format="png", metadata={"Software": None})
+        plt.close(figure)
 
 
 def label(name: str) -> str:
@@ -76,7 +92,7 @@ def _plain(axis: Any) -> None:
 def histogram(axes: Axes, result: dict[str, Any]) -> None:
     data = result["distribution"]
     edges = np.array(data["edges_deg"])
-    rows = result["by_rate"].get(str(result["setup"]["rate_hz"]), {})
+    rows = result.get("by_rate", {}).get(str(result["setup"]["rate_hz"]), {})
     for name, share in data["histogram"].items():
         style = STYLES[name]
         mae = f", mean {rows[name]['mae_deg']:.1f}°" if name in rows else ""
@@ -215,14 +231,83 @@ def learning(axes: Axes, result: dict[str, Any]) -> None:
     axes.legend()
 
 
-FIGURES: dict[str, tuple[Callable[[Axes, dict[str, Any]], None], tuple[float, float]]] = {
-    "histogram": (histogram, (7, 4.2)),
-    "cdf-48khz": (cdf, (7, 4.5)),
-    "mae-by-rate": (rates, (8.5, 5)),
-    "mae-by-spacing": (spacings, (8.5, 4.5)),
-    "offsets-position": (offsets_position, (5.5, 4.5)),
-    "offsets-azimuth": (offsets_azimuth, (5.5, 4.5)),
-    "time": (times, (7, 3.8)),
-    "learning": (learning, (7, 4.2)),
+def from_waveforms(axes: Axes, result: dict[str, Any]) -> None:
+    data = result["waveforms"]["mae_deg"]
+    names = list(next(iter(data.values())))[::-1]
+    height = 0.8 / len(data)
+    for k, (scene, row) in enumerate(data.items()):
+        at = np.arange(len(names)) + 0.4 - height * (k + 0.5)
+        values = [row[name] for name in names]
+        axes.barh(at, values, height, label=scene, color=("tab:purple", "tab:cyan")[k % 2])
+        for y, value in zip(at, values, strict=True):
+            axes.annotate(f"{value:.2f}°", (value, y), xytext=(3, 0), textcoords="offset points", va="center")
+    told = result["waveforms"]["paper_deg"]
+    axes.plot(
+        list(told.values()), [names.index(name) for name in told], label="the paper's own figures", **PAPER
+    )
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(visible=False, axis="y")
+    axes.set(
+        xlabel="mean |azimuth error| (degrees)",
+        xscale="log",
+        xlim=(0.08, 200),
+        title=f"From sound, {result['setup']['rate_hz'] / 1000:g} kHz, "
+        f"{100 * result['setup']['spacing_m']:g} cm, one frame",
+    )
+    _plain(axes.xaxis)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.12), ncol=3)
+
+
+def training(axes: Axes, result: dict[str, Any]) -> None:
+    """Of a report of `train`: error over SNR, beside least squares and the best possible."""
+    snr = [float(key) for key in result["by_snr"]]
+    styles = {"model": "mlp", "least squares": "least squares", "best possible": "best possible"}
+    for name, style in styles.items():
+        shown = f"model {result['name']}" if name == "model" else name
+        values = [row[name] for row in result["by_snr"].values()]
+        axes.plot(snr, values, label=shown, **STYLES[style])
+    axes.set(
+        xlabel="in-band SNR (dB)",
+        ylabel="mean |azimuth error| (degrees)",
+        yscale="log",
+        title=f"{result['name']}: one frame, {result['level']}",
+    )
+    _plain(axes.yaxis)
+    axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
+    axes.legend()
+
+
+def field(axes: Axes, result: dict[str, Any]) -> None:
+    """Of a report of `evaluate`: every label's error over azimuth, and how far the twin's reach."""
+    rows = [row for row in result["labels"] if row["error_deg"] is not None]
+    azimuth = np.array([row["azimuth_deg"] for row in rows])
+    error = np.array([row["error_deg"] for row in rows])
+    twin = np.array([row["twin_95_deg"] for row in rows])
+    order = azimuth.argsort()
+    axes.vlines(azimuth[order], -twin[order], twin[order], color="tab:cyan", alpha=0.5, linewidth=4.0,
+                label="95 % of the twin's errors at the same SNR and azimuth")  # fmt: skip
+    axes.plot(azimuth, error, "o", color="tab:red", markersize=4, label="field")
+    bias = result["statistics"]["bias_deg"]
+    axes.axhline(bias, color="tab:red", linestyle="--", linewidth=1, label=f"common turn, {bias:+.2f}°")
+    axes.set(
+        xlabel="true azimuth (degrees)",
+        ylabel="estimate less truth (degrees)",
+        xlim=(0, 360),
+        title=f"{len(rows)} labels, estimator {result['estimator']}",
+    )
+    axes.set_xticks(range(0, 361, 45))
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncol=3)
+
+
+FIGURES: dict[str, tuple[str, Drawing, tuple[float, float]]] = {
+    "histogram": ("distribution", histogram, (7, 4.2)),
+    "cdf-48khz": ("distribution", cdf, (7, 4.5)),
+    "mae-by-rate": ("by_rate", rates, (8.5, 5)),
+    "from-waveforms": ("waveforms", from_waveforms, (8.5, 4.8)),
+    "mae-by-spacing": ("by_spacing", spacings, (8.5, 4.5)),
+    "offsets-position": ("offsets", offsets_position, (5.5, 4.5)),
+    "offsets-azimuth": ("offsets", offsets_azimuth, (5.5, 4.5)),
+    "time": ("times", times, (7, 3.8)),
+    "learning": ("learning", learning, (7, 4.2)),
 }
-"""Name, drawing, size in inches."""
+"""Name: the experiment it shows, drawing, size in inches."""

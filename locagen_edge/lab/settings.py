@@ -6,14 +6,17 @@ file is `python -m locagen_edge.lab.settings`.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from locagen_edge.errors import SettingsError
 from locagen_edge.geometry import MicArray, equilateral
-from locagen_edge.settings import Settings, sample, setting
+from locagen_edge.settings import Settings, from_table, sample, setting
 from locagen_edge.sim.arrivals import TwinSettings
 from locagen_edge.sim.rotors import hubs_m
 from locagen_edge.sim.waveforms import RECORDED, SceneSettings
@@ -124,6 +127,15 @@ class SirenSettings:
 
 
 @dataclass(frozen=True)
+class FilterSettings:
+    """The filter before the MLP after FFT filtering: bins of the frame's spectrum outside are set to zero."""
+
+    band_hz: tuple[float, ...] = setting(
+        (300.0, 4700.0), "Lowest and highest frequency that is kept.", unit="Hz", least=0, most=48000
+    )
+
+
+@dataclass(frozen=True)
 class LabSettings(Settings):
     """All settings of the flight and of the workshop. Every section and every key may be left out."""
 
@@ -134,6 +146,7 @@ class LabSettings(Settings):
     forest: ForestSettings = ForestSettings()
     mlp: MlpSettings = MlpSettings()
     siren: SirenSettings = SirenSettings()
+    filter: FilterSettings = FilterSettings()
 
     def __post_init__(self) -> None:
         faults: list[str] = []
@@ -184,6 +197,8 @@ def _faults_of_scene(s: LabSettings) -> Iterator[str]:
             f"scene.gain_db: {len(scene.gain_db)} gains, "
             f"but array.positions_m has {len(s.array.positions_m)} microphones"
         )
+    if len(s.filter.band_hz) != 2 or not s.filter.band_hz[0] < s.filter.band_hz[1]:
+        yield f"filter.band_hz: {list(s.filter.band_hz)} is not a lowest and a highest frequency"
     seconds = (s.audio.frame + (scene.frames - 1) * s.audio.hop) / max(s.audio.rate_hz, 1)
     if scene.lead_s >= seconds:
         yield f"scene.lead_s: {scene.lead_s:g} s of noise alone, but a sample lasts {seconds:.3g} s"
@@ -206,6 +221,68 @@ def _smallest_spacing(s: LabSettings) -> float:
 def triangle(spacing_m: float) -> tuple[tuple[float, ...], ...]:
     """`array.positions_m` of an equilateral triangle of this side."""
     return tuple(tuple(float(x) for x in row) for row in equilateral(spacing_m).positions_m)
+
+
+# --- reading ------------------------------------------------------------------------------------------
+
+PAPER: dict[str, dict[str, Any]] = {}
+"""What a file that leaves a key out asks for: the defaults, which are the paper's."""
+
+OWN: dict[str, dict[str, Any]] = {
+    "twin": {"noise": "snr", "snr_db": 0.0, "height_span_m": 60.0},
+    "scene": {"snr_span_db": 30.0},
+    "data": {"samples": 100_000},
+    "dataset": {"level": "waveforms"},
+    "mlp": {"patience": 40},
+}
+"""The same for a model that is to fly: sound of 0 to 30 dB from a disc below, more of it, and passes enough
+for the learning rate to come down again, which is where the last tenths of a degree are."""
+
+
+def read(path: Path | None, defaults: dict[str, dict[str, Any]] = PAPER) -> LabSettings:
+    """Settings of a TOML file over `defaults`; None: the defaults alone.
+
+    Lists with one item per microphone that the file leaves out are as long as array.positions_m. Raises
+    `SettingsError` with one line per fault, each beginning with `section.key`.
+    """
+    table: dict[str, Any] = {}
+    if path is not None:
+        try:
+            table = tomllib.loads(path.read_bytes().decode("utf-8"))
+        except OSError as error:
+            raise SettingsError(f"{path}: cannot be read: {error.strerror}") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise SettingsError(f"{path}: is not TOML: {error}") from error
+    return from_table(_over(_per_microphone(table), _over(table, defaults)), LabSettings)
+
+
+def _per_microphone(table: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    array = table.get("array")
+    positions = array.get("positions_m") if isinstance(array, dict) else None
+    if not isinstance(positions, list):
+        return {}
+    mics = len(positions)
+    lists: dict[str, dict[str, Any]] = {
+        "audio": {"channel_map": list(range(mics))},
+        "twin": {"offset_samples": [0.0] * mics},
+        "scene": {"gain_db": [0.0] * mics},
+    }
+    given = {name: content for name, content in table.items() if isinstance(content, dict)}
+    return {
+        name: {key: value for key, value in keys.items() if key not in given.get(name, {})}
+        for name, keys in lists.items()
+        if name not in table or name in given
+    }
+
+
+def _over(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
+    """Sections of both; where both have a key, the first one's."""
+    merged = dict(second)
+    for name, content in first.items():
+        below = second.get(name, {})
+        both = isinstance(content, dict) and isinstance(below, dict)
+        merged[name] = {**below, **content} if both else content
+    return merged
 
 
 if __name__ == "__main__":

@@ -43,6 +43,9 @@ class TwinSettings:
     height_m: float = setting(
         0.0, "Height of the array above the source; the paper's is 0.", unit="m", least=0, most=1000
     )
+    height_span_m: float = setting(
+        0.0, "The height is drawn from height_m to this much above, uniform.", unit="m", least=0, most=1000
+    )
     position_error_m: float = setting(
         0.001,
         "Each microphone is off its place by up to this along x and y, uniform, anew for every sample.",
@@ -131,9 +134,9 @@ def draw(
         begin, stop = max(first, start), min(end, start + BLOCK)
         inside, outside = slice(begin - start, stop - start), slice(begin - first, stop - first)
         rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(number,))))
-        at, angle = _sources(twin, start, rng)
-        later_m = _later_m(places, twin, at, rng)
-        recorded = _recorded(later_m, at, speed_m_s, rate_hz, twin, noise_s, rng)
+        at, angle, height = _sources(twin, start, rng)
+        later_m = _later_m(places, twin, at, height, rng)
+        recorded = _recorded(later_m, at, height, speed_m_s, rate_hz, twin, noise_s, rng)
         for row, (i, j) in enumerate(array.pairs):
             np.subtract(recorded[j, inside], recorded[i, inside], out=measured[row, outside])
             np.subtract(later_m[j, inside], later_m[i, inside], out=true[row, outside])
@@ -144,8 +147,8 @@ def draw(
     return Arrivals(measured, true, position, azimuth)
 
 
-def _sources(twin: TwinSettings, start: int, rng: np.random.Generator) -> tuple[F32, F32]:
-    """Places (2, BLOCK) and azimuths (BLOCK,)."""
+def _sources(twin: TwinSettings, start: int, rng: np.random.Generator) -> tuple[F32, F32, F32]:
+    """Places (2, BLOCK), azimuths (BLOCK,), and heights of the array above them (BLOCK,) or (1,)."""
     if twin.source == "sweep":
         steps = max(round(360.0 / twin.step_deg), 1)
         degrees = (np.arange(start, start + BLOCK) % steps) * (360.0 / steps)
@@ -155,17 +158,19 @@ def _sources(twin: TwinSettings, start: int, rng: np.random.Generator) -> tuple[
         uniform = rng.random((2, BLOCK), dtype=np.float32)
         angle = (uniform[0] - np.float32(0.5)) * np.float32(2.0 * math.pi)
         radius = np.sqrt(uniform[1]) * np.float32(twin.range_m)  # the area inside r grows with r^2
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)]), angle
+    height = np.full(1, twin.height_m, np.float32)
+    if twin.height_span_m:
+        height = height + np.float32(twin.height_span_m) * rng.random(BLOCK, dtype=np.float32)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)]), angle, height
 
 
-def _later_m(places: F64, twin: TwinSettings, at: F32, rng: np.random.Generator) -> F32:
+def _later_m(places: F64, twin: TwinSettings, at: F32, height: F32, rng: np.random.Generator) -> F32:
     """How much longer the way to each microphone is than to the array's middle, metres (mics, BLOCK).
 
     |s - p| - |s| = (|p|^2 - 2 p.s) / (|s - p| + |s|), in which nothing large is subtracted: single precision
     is good to 10 nm at 100 m, where the difference of two distances would be good to 10 um.
     """
     x, y = at
-    height = np.float32(twin.height_m)
     direct = x * x + y * y + height * height
     middle = np.sqrt(direct)
     later = np.empty((len(places), BLOCK), np.float32)
@@ -189,6 +194,7 @@ def _later_m(places: F64, twin: TwinSettings, at: F32, rng: np.random.Generator)
 def _recorded(
     later_m: F32,
     at: F32,
+    height: F32,
     speed_m_s: float,
     rate_hz: float,
     twin: TwinSettings,
@@ -204,11 +210,11 @@ def _recorded(
     if twin.clock_ppm > 0.0:
         wrong = rng.random(number.shape, dtype=np.float32) - np.float32(0.5)
         wrong *= np.float32(2e-6 * twin.clock_ppm)
-        number += wrong * _travel_samples(at, twin, rate_hz / speed_m_s).astype(np.float32)
+        number += wrong * _travel_samples(at, height, rate_hz / speed_m_s).astype(np.float32)
     if twin.rounding == "none":
         return number
     if twin.phase == "aligned":
-        number += np.modf(_travel_samples(at, twin, rate_hz / speed_m_s))[0].astype(np.float32)
+        number += np.modf(_travel_samples(at, height, rate_hz / speed_m_s))[0].astype(np.float32)
         phase: F32 = np.zeros(1, np.float32)
     else:
         phase = rng.random((1 if twin.phase == "common" else len(number), BLOCK), dtype=np.float32)
@@ -218,8 +224,8 @@ def _recorded(
     return number
 
 
-def _travel_samples(at: F32, twin: TwinSettings, samples_per_m: float) -> F64:
+def _travel_samples(at: F32, height: F32, samples_per_m: float) -> F64:
     """Travel time to the array's middle in samples, in double precision: it may be 10,000 samples."""
     x, y = at.astype(np.float64)
-    samples: F64 = np.sqrt(x * x + y * y + twin.height_m**2) * samples_per_m
+    samples: F64 = np.sqrt(x * x + y * y + height.astype(np.float64) ** 2) * samples_per_m
     return samples

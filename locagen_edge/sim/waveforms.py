@@ -216,7 +216,7 @@ class Studio:
         detour_m = 2.0 * scene.mouth_m if scene.ground else 0.0
         delay = (radius + detour_m) / self.speed_m_s * self.rate_hz
         skew = max(map(abs, twin.offset_samples), default=0.0) + 1.0
-        longest_m = math.hypot(max(twin.range_m, NEAREST_M), twin.height_m)
+        longest_m = math.hypot(max(twin.range_m, NEAREST_M), twin.height_m + twin.height_span_m)
         drift = 2e-6 * twin.clock_ppm * (self.n + longest_m / self.speed_m_s * self.rate_hz)
         return math.ceil(delay + skew + drift) + REACH + FADE
 
@@ -314,9 +314,10 @@ class Studio:
             angle = rng.uniform(-np.pi, np.pi, count)
             # the area between the nearest place and r grows with r^2
             radius = np.sqrt(rng.uniform(NEAREST_M**2, max(twin.range_m, NEAREST_M) ** 2, count))
-        return np.stack(
-            [radius * np.cos(angle), radius * np.sin(angle), np.full(count, twin.height_m)], axis=1
-        )
+        height = np.full(count, twin.height_m)
+        if twin.height_span_m:
+            height += rng.uniform(0.0, twin.height_span_m, count)
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
 
     @cached_property
     def _share(self) -> float:
