@@ -26,7 +26,7 @@ static double seconds(void)
 static locagen_gcc *kernel;
 static const float *samples;
 static float *correlation;
-static float power[MOST_MICS];
+static float power[2 * MOST_MICS];
 
 /* Sets up the kernel for frames that all hold `in`, which must stay where it is. Returns 0 or an error. */
 int bench_kernel_init(const locagen_gcc_config *config, const float *in)

@@ -18,17 +18,20 @@ INLINE vec inverse_root(vec x)
     return guess * (2.18936135f + h * (-2.19180671f + h * (1.31552748f - 0.31308287f * h)));
 }
 
-/* X -> X / sqrt(|X|^2 + floor). */
-STEP void whiten(const state *s, quad floor, spectrum bins)
+/* X -> X / sqrt(|X|^2 + floor). Returns the sums of what is left of the squared magnitudes, at most 1 a bin. */
+STEP quad whiten(const state *s, quad floor, spectrum bins)
 {
-    vec floors = both(floor);
+    vec floors = both(floor), left = {0};
     long end = 4 * ((s->spectrum.last_bin | 1L) + 1);
     for (long at = 4 * (s->spectrum.first_bin & ~1L); at < end; at += WIDTH) {
         vec re = load(bins.re + at), im = load(bins.im + at);
-        vec scale = inverse_root(re * re + im * im + floors);
+        vec power = re * re + im * im;
+        vec scale = inverse_root(power + floors);
+        left += power * scale * scale;
         store(bins.re + at, re * scale);
         store(bins.im + at, im * scale);
     }
+    return folded(left);
 }
 
 /* Unit bins of one group of up to four microphones; returns the mask of those that are not finite. */
@@ -37,12 +40,14 @@ INLINE int unit_bins(const state *s, const float *in, int group, float *power)
     /* Half of the range is left for the floor. */
     quad sum;
     int bad = group_bins(&s->spectrum, in, group, FLT_MAX / 2, &sum);
-    for (int lane = 0; lane < 4 && 4 * group + lane < s->spectrum.mics; lane++)
-        power[4 * group + lane] = sum[lane];
     quad floor = sum * (s->relative_floor * s->bin_share);
     for (int lane = 0; lane < 4; lane++)
         floor[lane] = floor[lane] > s->floor ? floor[lane] : s->floor;
-    whiten(s, floor, (spectrum){s->spectrum.bins_re[group], s->spectrum.bins_im[group]});
+    quad left = whiten(s, floor, (spectrum){s->spectrum.bins_re[group], s->spectrum.bins_im[group]});
+    for (int lane = 0; lane < 4 && 4 * group + lane < s->spectrum.mics; lane++) {
+        power[4 * group + lane] = sum[lane];
+        power[s->spectrum.mics + 4 * group + lane] = left[lane] * s->bin_share;
+    }
     return bad;
 }
 

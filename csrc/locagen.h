@@ -86,11 +86,12 @@ size_t locagen_gcc_sizeof(const locagen_gcc_config *config);
 /* Sets up a state in `memory` of locagen_gcc_sizeof bytes. */
 int locagen_gcc_init(locagen_gcc *memory, const locagen_gcc_config *config);
 
-/* One frame. correlation: pairs * (2 * lags + 1). power: mean square of each microphone in the
- * band, corrected for the window: a full-scale sine gives 0.5. Returns 0, or a positive mask with bit
+/* One frame. correlation: pairs * (2 * lags + 1). levels: 2 * mics values; the mean square of each microphone in
+ * the band, corrected for the window (a full-scale sine gives 0.5), then the share of the band that each fills:
+ * the mean of p / (p + f), which is what a coherent pair's peak can reach. Returns 0, or a positive mask with bit
  * m set where microphone m held a sample that is not finite, or so large (about 1e18) that its power
  * overflows: such a microphone counts as silent, its power is 0. */
-int locagen_gcc_process(locagen_gcc *state, const float *in, float *correlation, float *power);
+int locagen_gcc_process(locagen_gcc *state, const float *in, float *correlation, float *levels);
 
 typedef struct {
     int32_t mics;

@@ -82,7 +82,7 @@ static bench set_up(locagen_gcc_config config, path chosen)
     ((state *)(((uintptr_t)b.kernel + 63) & ~(uintptr_t)63))->frame = chosen;
     b.in = allocate(sizeof(float) * (size_t)(config.mics * config.frame));
     b.correlation = allocate(sizeof(float) * (size_t)(b.pairs * b.columns));
-    b.power = allocate(sizeof(float) * (size_t)config.mics);
+    b.power = allocate(2 * sizeof(float) * (size_t)config.mics);
     for (int n = 0; n < config.mics * config.frame; n++)
         b.in[n] = uniform();
     return b;
@@ -100,7 +100,7 @@ static int run(bench *b)
 {
     for (int n = 0; n < b->pairs * b->columns; n++)
         b->correlation[n] = NAN;
-    for (int m = 0; m < b->config.mics; m++)
+    for (int m = 0; m < 2 * b->config.mics; m++)
         b->power[m] = NAN;
     return locagen_gcc_process(b->kernel, b->in, b->correlation, b->power);
 }
@@ -136,10 +136,14 @@ static double error_of(const bench *b)
         double off = fabs(b->power[m] - power) / power;
         worst = off > worst ? off : worst;
         double floor = fmax(c->floor, c->relative_floor * power / bins);
+        double fill = 0;
         for (int at = m * bins; at < (m + 1) * bins; at++) {
             double scale = 1 / sqrt(re[at] * re[at] + im[at] * im[at] + floor);
             re[at] *= scale, im[at] *= scale;
+            fill += (re[at] * re[at] + im[at] * im[at]) / bins;
         }
+        off = fabs(b->power[c->mics + m] - fill);
+        worst = off > worst ? off : worst;
     }
     const float *row = b->correlation;
     for (int i = 0; i < c->mics; i++)

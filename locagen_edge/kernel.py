@@ -90,9 +90,10 @@ class GccPhat:
         self._shape = (mics, frame)
         # C writes here, the caller gets copies: that is faster than a new pointer for every new array.
         self._correlation = np.empty((len(self.pairs), 2 * lags + 1), _FLOAT32)
-        self._power = np.empty(mics, _FLOAT32)
+        self._levels = np.zeros((2, mics), _FLOAT32)
+        self._power = self._levels[0]
         self._correlation_pointer = ffi.from_buffer(_FLOATS, self._correlation)
-        self._power_pointer = ffi.from_buffer(_FLOATS, self._power)
+        self._power_pointer = ffi.from_buffer(_FLOATS, self._levels)
         self._process = lib.locagen_gcc_process
 
     def process(
@@ -115,6 +116,15 @@ class GccPhat:
         source = _pointer(samples, self._shape)
         bad: int = self._process(self._state, source, self._correlation_pointer, self._power_pointer)
         return self._correlation.copy(), self._power.copy(), bad
+
+    @property
+    def fill(self) -> npt.NDArray[np.float32]:
+        """Share of the band that each microphone filled in the last frame, float32, shape `(mics,)`.
+
+        Mean over the band's bins of `p / (p + f)`: what a pair of coherent microphones can reach at its peak.
+        """
+        fill: npt.NDArray[np.float32] = self._levels[1].copy()
+        return fill
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,6 +55,8 @@ class Correlation:
     """(lags,) seconds; positive: the pair's second microphone hears later"""
     power: F32
     """(mics,) mean square in the band, full scale 1.0"""
+    fill: F32
+    """(mics,) share of the band that the sound fills above the floor: what a coherent peak can reach"""
     bad_mics: int
     """bit m set: microphone m held a sample that is not finite, and counts as silent"""
 

@@ -228,6 +228,24 @@ def test_permuted_microphones_permute_pairs(order: list[int], seed: int) -> None
         np.testing.assert_allclose(row, twin, atol=1e-6)  # float32 sums in another order
 
 
+def test_fill_is_the_share_of_the_band_above_the_floor() -> None:
+    """Noise in half of the band's bins, and silence; the reference's definition, whitened bins squared."""
+    found = kernel(3, relative_floor=1e-2)
+    samples = noise(3, 1024)
+    spectrum = np.fft.rfft(samples[1])
+    spectrum[np.fft.rfftfreq(1024, 1e-4) > 2500.0] = 0.0
+    samples[1] = np.fft.irfft(spectrum)
+    samples[2] = 0.0
+    correlation, _, _ = found.process(samples)
+    whole, half, nothing = found.fill
+    assert 0.93 < whole < 1.0
+    assert half == pytest.approx(whole / 2, abs=0.03)
+    assert nothing == 0.0
+    same = np.ascontiguousarray(samples[[1, 1, 1]])
+    correlation, _, _ = found.process(same)
+    assert correlation.max() == pytest.approx(found.fill[0], rel=1e-4)  # a coherent pair's peak
+
+
 @pytest.mark.parametrize("frame", [256, 512, 1024, 2048, 4096])
 @pytest.mark.parametrize("frequency_hz", [500.0, 1234.5, 4000.0])
 def test_power_of_a_sine_is_a_half(frame: int, frequency_hz: float) -> None:

@@ -40,4 +40,4 @@ class Correlator:
         if frame.rate_hz != self._rate_hz:
             raise SourceError(f"a frame at {frame.rate_hz:g} Hz came, audio.rate_hz is {self._rate_hz:g} Hz")
         values, power, bad_mics = self._kernel.process(frame.samples)
-        return Correlation(values=values, lag_s=self._kernel.lag_s, power=power, bad_mics=bad_mics)
+        return Correlation(values, self._kernel.lag_s, power, self._kernel.fill, bad_mics)

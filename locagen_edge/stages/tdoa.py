@@ -11,10 +11,9 @@ Statistics*, section 3.5), and with the relative peak height p standing for E[co
     sigma = sqrt(RHO * mean(w^2) * (1 - p^4) / (2 K)) / |r''|
 
 RHO counts that the Hann window correlates neighbouring bins (2/3 and 1/6 in amplitude): 1 + 2 (4/9 + 1/36).
-r'' is the measured curvature, so that a sound which fills only part of the band gets its wider sigma. p is
-relative to what a coherent noise-like sound reaches, which the relative floor keeps below 1: a bin of
-exponentially distributed power x counts x / (x + floor). Sounds with emptier spectra reach less, and get a
-sigma on the wide side.
+r'' is the measured curvature. A sound that fills only the share F of the band above the floor (the mean of
+p / (p + f) over the bins, of both microphones) reaches a peak of F at most and makes noise in F of the bins:
+p is relative to F, and the noise is that of F K bins.
 """
 
 from __future__ import annotations
@@ -48,9 +47,6 @@ class PeakPicker:
         omega = 2.0 * np.pi * bins * rate_hz / frame
         self._limit_s = array.spacing_m / speed_m_s
         self._slope_noise = math.sqrt(RHO * float(np.mean(omega**2)) / (2.0 * len(bins)))
-        share = (np.arange(4096) + 0.5) / 4096
-        power = -np.log(share)
-        self._full_peak = float(np.mean(power / (power + 10 ** (settings.relative_floor_db / 10))))
         # a lag of pure noise has the variance RHO / (2 K); the peak is the highest of the lags that differ
         lags = 1.0 + 2.0 * float(self._limit_s.max()) * (high - low)
         self._least_peak = math.sqrt(RHO / len(bins) * math.log(lags / CHANCE))
@@ -58,6 +54,7 @@ class PeakPicker:
         self._outside: np.ndarray | None = None
         self._margin_s = LAG_MARGIN_SAMPLES / rate_hz
         self._rows = np.arange(len(array.pairs))
+        self._first, self._second = np.array(array.pairs).T
 
     def _mask(self, lag_s: F64) -> np.ndarray:
         """(pairs, lags) True where a pair's own spacing forbids the lag, or no neighbour is left."""
@@ -74,13 +71,14 @@ class PeakPicker:
         top = values[self._rows, best].astype(np.float64)
         right = values[self._rows, best + 1].astype(np.float64)
         bend = 2.0 * top - left - right
-        good = (top > self._least_peak) & (bend > 0.0)
+        fill = np.sqrt(correlation.fill[self._first].astype(np.float64) * correlation.fill[self._second])
+        good = (top > self._least_peak * np.sqrt(fill)) & (bend > 0.0)
         bend = np.where(good, bend, 1.0)
         shift = np.clip((right - left) / (2.0 * bend), -1.0, 1.0)
         peak = np.clip(top + (right - left) * shift / 4.0, 0.0, 1.0)
         curvature = bend / self._step_s**2
-        coherence = np.minimum(peak / self._full_peak, 1.0)
-        noise = np.sqrt(np.maximum(1.0 - coherence**4, LEAST_NOISE))
+        coherence = np.minimum(peak / np.maximum(fill, 1e-9), 1.0)
+        noise = np.sqrt(fill * np.maximum(1.0 - coherence**4, LEAST_NOISE))
         sigma = self._slope_noise * noise / curvature
         return Tdoa(
             delay_s=np.where(good, correlation.lag_s[best] + shift * self._step_s, np.nan),
