@@ -61,7 +61,7 @@ $(VENV)/.flight: $(KERNEL)
 # --- for developers
 
 .PHONY: test
-test: $(VENV)/.dev csrc-test ## sets up and runs all tests
+test: $(VENV)/.dev csrc-test csrc-test-aarch64 ## sets up and runs all tests
 	$(call need,libasound2-dev,tests with a virtual sound card)
 	$(BIN)/python -m pytest
 

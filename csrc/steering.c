@@ -321,9 +321,9 @@ int locagen_steer_listen(locagen_steer *memory, const float *in, float *power)
         return LOCAGEN_E_NULL;
     steer *s = state_of(memory);
     int bad = s->paths->listen(s, in, power);
-    double loudest = 0;
+    float loudest = 0; /* not fmax of doubles: gcc 12 for aarch64 breaks down over vectors of that */
     for (int m = 0; m < s->mics; m++)
-        loudest = fmax(loudest, power[m]);
+        loudest = power[m] > loudest ? power[m] : loudest;
     s->frame_mics = 0;
     for (int m = 0; m < s->mics; m++)
         if (!(bad >> m & 1) && power[m] >= SILENT * loudest)
