@@ -192,13 +192,15 @@ def run(trials: int, names: list[str]) -> Iterator[tuple[str, dict[str, Any]]]:
     for cell in names:
         make, arguments = CELLS[cell]
         errors: dict[str, list[float]] = {name: [] for name in methods}
+        silent = dict.fromkeys(methods, 0)
         bounds = []
         for seed in tqdm(range(trials), desc=cell, leave=False, disable=not sys.stderr.isatty()):
             trial = make(*arguments, np.random.default_rng([seed, len(cell)]))
             bounds.append(trial.bound_deg)
             for name, method in methods.items():
                 azimuth = method(trial)
-                # no bearing counts as the mean error of a guess
+                # no bearing is an answer, told apart, and counts as the mean error of a guess
+                silent[name] += azimuth is None
                 error = math.pi / 2 if azimuth is None else abs(wrap(azimuth - trial.azimuth))
                 errors[name].append(math.degrees(error))
         yield (
@@ -210,6 +212,7 @@ def run(trials: int, names: list[str]) -> Iterator[tuple[str, dict[str, Any]]]:
                         "mean_deg": float(np.mean(values)),
                         "median_deg": float(np.median(values)),
                         "beyond_15_deg": float(np.mean(np.array(values) > 15)),
+                        "no_bearing": silent[name] / trials,
                     }
                     for name, values in errors.items()
                 },
@@ -234,7 +237,7 @@ def main() -> None:
                 times = f"{r['mean_deg'] / bound:8.2f} x" if bound else " " * 10
                 print(
                     f"    {name:28}mean {r['mean_deg']:7.3f}  median {r['median_deg']:7.3f}  "
-                    f"beyond 15 deg {r['beyond_15_deg']:6.1%}{times}"
+                    f"beyond 15 deg {r['beyond_15_deg']:6.1%} none {r['no_bearing']:6.1%}{times}"
                 )
         sys.stdout.flush()
     report.write(arguments.output, missing=judges()[1], cells=results)
