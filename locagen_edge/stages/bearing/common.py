@@ -42,6 +42,9 @@ class OnDelays:
 NOWHERE_RAD = math.pi / math.sqrt(3.0)
 """1-sigma of an angle that may be anything: the standard deviation of a uniform one, 104 degrees."""
 
+LARGEST_AZIMUTH_SIGMA_RAD = math.radians(60.0)
+"""Beyond this the answer is "no bearing"."""
+
 
 def no_bearing(estimator: str) -> Bearing:
     """The answer where the delays say nothing: silence, or too few live microphones."""

@@ -20,11 +20,14 @@ import numpy as np
 
 from locagen_edge.geometry import angles, wrap
 from locagen_edge.settings import Settings
-from locagen_edge.stages.bearing.common import NOWHERE_RAD, DelayModel, Estimator, no_bearing
+from locagen_edge.stages.bearing.common import (
+    LARGEST_AZIMUTH_SIGMA_RAD,
+    NOWHERE_RAD,
+    DelayModel,
+    Estimator,
+    no_bearing,
+)
 from locagen_edge.types import F64, Bearing, Tdoa
-
-LARGEST_AZIMUTH_SIGMA_RAD = math.radians(60.0)
-"""Beyond this the answer is "no bearing"."""
 
 FLAT_M = 1e-4
 """Thinner than this an array is flat: 0.1 mm is 0.3 us, a tenth of what a frame's noise leaves."""

@@ -13,13 +13,10 @@ import math
 from locagen_edge.geometry import tolerance_rad
 from locagen_edge.kernel import Steered
 from locagen_edge.settings import Settings
-from locagen_edge.stages.bearing.common import NOWHERE_RAD, no_bearing
+from locagen_edge.stages.bearing.common import LARGEST_AZIMUTH_SIGMA_RAD, NOWHERE_RAD, no_bearing
 from locagen_edge.types import Bearing, Frame, Tdoa
 
 NAME = "steered"
-
-LARGEST_SIGMA_RAD = math.radians(60.0)
-"""Beyond this an azimuth is none."""
 
 DEAD = 1e-5
 """Of the loudest microphone's power: what the kernel takes for a dead one."""
@@ -69,7 +66,7 @@ class SteeredLocator:
         azimuth_sigma = math.hypot(azimuth_sigma, tolerance)
         elevation_sigma = math.hypot(elevation_sigma, tolerance)
         return Bearing(
-            azimuth_rad=source.azimuth_rad if azimuth_sigma < LARGEST_SIGMA_RAD else None,
+            azimuth_rad=source.azimuth_rad if azimuth_sigma < LARGEST_AZIMUTH_SIGMA_RAD else None,
             azimuth_sigma_rad=min(azimuth_sigma, NOWHERE_RAD),
             elevation_rad=source.elevation_rad,
             elevation_sigma_rad=min(elevation_sigma, NOWHERE_RAD),
