@@ -8,12 +8,11 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 from locagen_edge.errors import LocagenError, SourceHungError
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.link import Link, parse
-from locagen_edge.models import default_directory, load_model, read_manifest
+from locagen_edge.models import directory_of, load_model, read_manifest
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import BearingSettings, Settings
 from locagen_edge.sources import open_source
@@ -38,18 +37,16 @@ def check(settings: Settings, seconds: float) -> Iterator[Finding]:
         yield True, "estimator", settings.bearing.estimator
     except LocagenError as error:
         yield False, "estimator", str(error)
-        pipeline = Pipeline(
-            replace(settings, bearing=BearingSettings())
-        )  # the microphones can be judged still
+        # the microphones can still be judged
+        pipeline = Pipeline(replace(settings, bearing=BearingSettings()))
     yield from asyncio.run(_listen(settings, pipeline, max(seconds, LEAST_S)))
     yield asyncio.run(_link(settings, seconds))
 
 
 def _models(settings: Settings) -> Iterator[Finding]:
     """Every model of the manifest is loaded; one made for another array is fine as long as it is not used."""
-    directory = Path(settings.models.directory) if settings.models.directory else default_directory()
     try:
-        names = sorted(read_manifest(directory))
+        names = sorted(read_manifest(directory_of(settings)))
     except LocagenError as error:
         # without a manifest everything but the learned estimators works
         yield not settings.bearing.estimator.startswith("model:"), "models", str(error)

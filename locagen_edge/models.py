@@ -26,6 +26,11 @@ Model = Callable[[F32], list[F32]]
 """Input array in, list of output arrays out."""
 
 
+def directory_of(settings: Settings) -> Path:
+    """Where the models lie: `models.directory`, or those that came with the program."""
+    return Path(settings.models.directory) if settings.models.directory else default_directory()
+
+
 def default_directory() -> Path:
     """Where the models that came with the program lie: beside the checkout, or below the prefix."""
     beside = Path(__file__).resolve().parent.parent / "models"
@@ -48,7 +53,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
 
 def load_model(name: str, settings: Settings) -> Model:
     """A checked model with one input, ready to call. Raises `ModelError`, naming the model and the reason."""
-    directory = Path(settings.models.directory) if settings.models.directory else default_directory()
+    directory = directory_of(settings)
     entries = read_manifest(directory)
     if name not in entries:
         raise ModelError(

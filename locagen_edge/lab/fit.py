@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from locagen_edge.lab.settings import MlpSettings, SirenSettings
+from locagen_edge.lab.settings import MlpSettings
 from locagen_edge.types import F32, F64
 
 Tell = Callable[[int, int, float], None]
@@ -34,7 +34,7 @@ def fit(
     model: torch.nn.Module,
     x: F32,
     azimuth_rad: F32,
-    s: MlpSettings | SirenSettings,
+    s: MlpSettings,
     validation_share: float,
     tell: Tell = quiet,
 ) -> History:
@@ -58,7 +58,7 @@ def _fit(
     model: torch.nn.Module,
     x: F32,
     azimuth_rad: F32,
-    s: MlpSettings | SirenSettings,
+    s: MlpSettings,
     held: int,
     tell: Tell,
 ) -> History:

@@ -29,7 +29,6 @@ from locagen_edge.lab.settings import ForestSettings
 from locagen_edge.types import F32, F64
 
 OPSETS = {"": OPSET, "ai.onnx.ml": 1}
-READINGS = ("centre", "mean", "median")
 CANDIDATES = 1440
 """Angles among which the median is looked for: a quarter of a degree apart, 0.06 degrees of error at most."""
 

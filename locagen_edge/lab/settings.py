@@ -103,11 +103,10 @@ class MlpSettings:
 
 
 @dataclass(frozen=True)
-class SirenSettings:
+class SirenSettings(MlpSettings):
     """SIREN: a perceptron whose activation is a sine (Sitzmann et al., NeurIPS 2020)."""
 
-    width: int = setting(64, "Neurons in each hidden layer.", least=1, most=4096)
-    layers: int = setting(2, "Hidden layers.", least=1, most=16)
+    rate: float = setting(2e-3, "Highest learning rate of AdamW.", least=1e-7, most=1)
     omega: float = setting(
         1.0,
         "Factor inside the first sine, for standardised inputs. The article's 30 is for the pixels of an "
@@ -117,13 +116,6 @@ class SirenSettings:
     omega_hidden: float = setting(
         1.0, "Factor inside the other sines; the weights start smaller by it.", least=0.01, most=10000
     )
-    rate: float = setting(2e-3, "Highest learning rate of AdamW.", least=1e-7, most=1)
-    batch: int = setting(512, "Samples in a step.", unit="samples", least=1, most=1_000_000)
-    epochs: int = setting(60, "Passes over the data at most.", least=1, most=10000)
-    patience: int = setting(
-        15, "Passes without a better validation error before it stops.", unit="passes", least=1, most=10000
-    )
-    seed: int = setting(1, "Of weights and order.", least=0, most=2**31 - 1)
 
 
 @dataclass(frozen=True)
