@@ -131,6 +131,24 @@ class Track:
     """0 to 1: share of the recent frames that held a call and agreed with the track"""
 
 
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where the vehicle was at one moment, and how it was turned. None: not known, or too old."""
+
+    t_ns: int
+    """monotonic time, as of `Frame.t_ns`"""
+    attitude: tuple[float, float, float, float] | None
+    """unit quaternion w, x, y, z that turns vectors of the body (FRD) into those of the earth (NED): that
+    of MAVLink's ATTITUDE_QUATERNION"""
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    altitude_m: float | None = None
+    """above mean sea level"""
+    height_m: float | None = None
+    """above the ground below"""
+    height_sigma_m: float = 0.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """All that the pipeline says of one frame."""
