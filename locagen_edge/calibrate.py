@@ -17,7 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from locagen_edge.calibration import LEAST_FRAMES, TEMPERATURE_C, Arrivals, Calibration, Walk, calibrate
+from locagen_edge.calibration import (
+    LEAST_FRAMES,
+    NEAREST_M,
+    TEMPERATURE_C,
+    Arrivals,
+    Calibration,
+    Walk,
+    calibrate,
+)
 from locagen_edge.errors import CalibrationError
 from locagen_edge.files import write
 from locagen_edge.geometry import MicArray, wrap
@@ -252,9 +260,10 @@ def at_angles(heard: Heard, table: F64, walk: Walk, path: Path) -> tuple[Heard, 
         elevation = np.interp(time_s, table[:, 0], np.radians(table[:, 2]))
     old = heard.arrivals
     arrivals = Arrivals(old.delay_s[within], old.covariance_s2[within], time_s)
-    known = int(np.sum((table[:, 0] >= time_s[0]) & (table[:, 0] <= time_s[-1])))
+    first, last = np.searchsorted(table[:, 0], [time_s[0], time_s[-1]])
+    known = int(last - first + 1 + (table[first, 0] > time_s[0]))  # the lines around the frames, at both ends
     angles = np.stack([azimuth, elevation], axis=1)
-    return replace(heard, arrivals=arrivals), replace(walk, angles=angles, known=max(known, 1))
+    return replace(heard, arrivals=arrivals), replace(walk, angles=angles, known=known)
 
 
 # --- for people ---------------------------------------------------------------------------------------
@@ -290,7 +299,7 @@ def report(heard: Heard, found: Calibration, settings: Settings, walk: Walk) -> 
         yield f"{yaw}, that of array.positions_m in the settings; --angles would tell it"
         if abs(found.turned_rad) > math.pi and walk.clockwise is None:
             yield f"            if you did not go {sense}, two channels are swapped: see --sense"
-    yield f"distance    {_distance(walk, settings)}"
+    yield f"distance    {_distance(walk)}"
     yield ""
     yield _row(["microphone", "x mm", "y mm", "z mm", "moved mm", "late us", "gain dB"])
     moved = np.linalg.norm(found.positions_m - settings.mic_array.positions_m, axis=1)
@@ -332,12 +341,10 @@ def _scale(found: Calibration, settings: Settings, walk: Walk) -> str:
     return air if found.heights else f"{air} and a sound at an elevation of {level}"
 
 
-def _distance(walk: Walk, settings: Settings) -> str:
+def _distance(walk: Walk) -> str:
     if math.isfinite(walk.distance_m):
         return f"{walk.distance_m:g} m: the wave's curvature is taken out"
-    flat = settings.mic_array.positions_m - settings.mic_array.positions_m.mean(axis=0)
-    bend_m = float(np.max(np.sum(flat**2, axis=1))) / 4.0  # r^2 / 2 D at D = 2 m
-    return f"not given: from 2 m the wave's curvature adds up to {1e6 * bend_m / settings.speed_m_s:.1f} us"
+    return f"not given: {NEAREST_M:g} m or more is within the sigmas; --distance-m takes the curvature out"
 
 
 def bearing_errors(settings: Settings, found: Calibration) -> tuple[float, float]:
@@ -376,8 +383,11 @@ def calibrated(settings: Settings, heard: Heard, found: Calibration) -> Settings
 
 
 def write_settings(path: Path, settings: Settings, recording: Path) -> None:
-    """The whole settings file with its manual, or what was there before."""
+    """The whole settings file with its manual, or what was there before. Raises `CalibrationError`."""
     origin = (
         f"[array] was measured by `locagen-edge calibrate` from {recording.name!r}; the rest is as it was."
     )
-    write(path, sample(settings, origin))
+    try:
+        write(path, sample(settings, origin))
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from error

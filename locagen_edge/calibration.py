@@ -24,7 +24,7 @@ What no sound from unknown directions tells, and where it is taken from:
 A source at a known distance D is no plane wave: what its curvature adds, up to r^2 / (2 D c) at a microphone
 r from the middle, is computed from the positions of the step before. Without a distance it is left out: it
 goes with twice the azimuth, so that over a full circle it hardly moves the ellipse (0.05 mm and 0.3 us at 1 m
-for a triangle of 10 cm), but swells the residual.
+for a triangle of 10 cm), and what a sound 2 m away would change is counted into the sigmas.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -49,6 +49,9 @@ WIDEST_GAP_DEG = 120.0
 MOST_POSITION_M = 0.001
 MOST_DELAY_S = 3e-6
 """Sigmas beyond these, half a degree of bearing each, count as "could not determine"."""
+
+NEAREST_M = 2.0
+"""A sound whose distance is not told may be as near as this."""
 
 UNLIKE = 0.25
 """Share by which a distance between two microphones may differ from the settings' before they are taken for
@@ -182,6 +185,14 @@ def calibrate(
 
     positions = _positions(fit.slope, speed_m_s, nominal)
     covariance, misfit, weight = problem.covariance(fit)
+    if math.isinf(walk.distance_m):
+        # the same frames, taken for near ones
+        near = _Problem(arrivals, nominal, speed_m_s, replace(walk, distance_m=NEAREST_M)).solved(fit)
+        nearby = _positions(near.slope, speed_m_s, nominal)
+        nearby[:, :2] = nearby[:, :2] @ _rotation(aligning_angle(nearby[:, :2], positions[:, :2]))
+        bent = nearby - positions, np.concatenate([[0.0], near.offset - fit.offset])
+    else:
+        bent = np.zeros_like(positions), np.zeros(others + 1)
     scale = _scale_sigma(temperature_c, walk)
     position_sigma, delay_sigma, yaw = _sigmas(covariance, positions, speed_m_s, fit.slope.shape[1])
     if walk.angles is None:  # from the nominal positions
@@ -193,6 +204,7 @@ def calibrate(
     notes = _elsewhere(positions, nominal) if walk.angles is not None else ()
     if not notes:
         doubts += _unlike(positions, nominal)
+    position_sigma, delay_sigma = np.hypot(position_sigma, bent[0]), np.hypot(delay_sigma, bent[1])
     measured = 3 if problem.heights else 2
     position_sigma[:, :measured] = np.hypot(position_sigma[:, :measured], scale * positions[:, :measured])
     step = _wrapped(np.diff(fit.azimuth[weight > 0.2]))
@@ -306,8 +318,7 @@ class _Problem:
             solution = np.linalg.lstsq(design[keep], target[keep], rcond=None)[0]
             off = np.linalg.norm(target - design @ solution, axis=1)
             keep = off <= 3.0 * np.median(off[keep])
-        slope: F64 = solution[:-1].T
-        return _Fit(slope, solution[-1], self._told.copy())
+        return _Fit(np.asarray(solution[:-1].T, np.float64), solution[-1], self._told.copy())
 
     def _ellipse(self) -> tuple[F64, F64] | None:
         """A and d from the ellipse on which the delays lie; None where they lie on none."""

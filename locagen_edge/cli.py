@@ -142,8 +142,8 @@ def _parser() -> argparse.ArgumentParser:
         "Put the array level in the open, motors off, and walk once or more all the way round it, a few "
         "metres away, with a loud broad-band sound (noise from a speaker, claps, speech) at its height. "
         "Prints what was found with its 1-sigma; exit code 1, and nothing is written, where the recording "
-        "could not determine it. The angle table has the columns time_s (of the recording), azimuth_deg (clockwise "
-        "from ahead) and maybe elevation_deg; between two lines the sound goes the shorter way.",
+        "could not determine it. The angle table has the columns time_s (of the recording), azimuth_deg "
+        "(clockwise from ahead) and maybe elevation_deg; between two lines the sound goes the shorter way.",
     )
     calibrate.add_argument("file", type=Path, metavar="FILE.wav", help="WAV or FLAC, any rate, as recorded")
     calibrate.add_argument("--write", type=Path, metavar="PATH", help="write settings with what was found")
@@ -163,7 +163,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     calibrate.add_argument(
         "--distance-m", type=_positive, default=math.inf, metavar="N",
-        help="from the array's middle, for the wave's curvature (default: far away)",
+        help="from the array's middle, for the wave's curvature (default: unknown, 2 m or more)",
     )  # fmt: skip
     calibrate.add_argument(
         "--margin", type=_number(1, 20), default=1.5, metavar="N",

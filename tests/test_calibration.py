@@ -95,7 +95,7 @@ def test_shape_and_delays_come_out_within_their_sigma(name, wild):
     shape, late_over_sigma = [], []
     for seed in range(12):
         positions, late = array_off(nominal, seed)
-        result = found(heard(positions, late, wild=wild, seed=seed), nominal)
+        result = found(heard(positions, late, wild=wild, seed=seed), nominal, Walk(distance_m=1e6))
         assert result.doubts == ()
         assert miss_m(result, positions) < 3e-4
         assert np.abs(result.delays_s - late).max() < 1e-6
@@ -258,10 +258,7 @@ def test_noise_is_no_array(name):
         arrivals = heard(ARRAYS[name], np.zeros(len(ARRAYS[name])))
         rng = np.random.default_rng(seed)
         lost = replace(arrivals, delay_s=rng.uniform(-3e-4, 3e-4, arrivals.delay_s.shape))
-        try:
-            assert found(lost, ARRAYS[name]).doubts
-        except CalibrationError:
-            pass
+        assert found(lost, ARRAYS[name]).doubts
 
 
 def test_another_array_is_refused():
