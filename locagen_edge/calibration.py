@@ -67,6 +67,14 @@ TEMPERATURE_C = 2.0
 FREEDOM = 4.0
 """Of Student's t: a few per cent of wild frames lose their weight."""
 
+BESIDE = 3
+BESIDE_S = 1.5
+"""Frames to each side, no further away than this, that a frame has to be like."""
+JUMP_S = 1e-5
+"""Five degrees of a 10 cm array: a brisk walker does half of that within those frames."""
+MOST_JUMP = 0.15
+"""Of the array's longest delay: nine degrees."""
+
 MOST_STEPS = 60
 HEIGHTS_SPREAD = 0.08
 """Standard deviation of sin(elevation), 5 degrees, from which known angles tell the heights."""
@@ -115,7 +123,7 @@ class Calibration:
     delay_sigma_s: F64
     """(mics,)"""
     azimuth_rad: F64
-    """(frames,) of the sound, as fitted"""
+    """(frames,) of the sound, as fitted; frames unlike their neighbours are left out"""
     weight: F64
     """(frames,) 0 to 1: what each counted"""
     rms_before_s: float
@@ -171,6 +179,14 @@ def calibrate(
     frames, others = arrivals.delay_s.shape
     if frames < LEAST_FRAMES:
         raise CalibrationError(f"only {frames} usable frames; at least {LEAST_FRAMES} are needed")
+    steady = _steady(arrivals, MOST_JUMP * MicArray(nominal_m).longest_delay_s(speed_m_s))
+    if np.sum(steady) < LEAST_FRAMES:
+        raise CalibrationError(
+            f"the delays jump about: {np.sum(steady)} of {frames} frames are like those before and after them: "
+            "see that one sound goes round, louder than all others and their echoes"
+        )
+    arrivals = Arrivals(*(a[steady] for a in (arrivals.delay_s, arrivals.covariance_s2, arrivals.time_s)))
+    walk = walk if walk.angles is None else replace(walk, angles=walk.angles[steady])
     if others < 2 and walk.angles is None:
         raise CalibrationError("two microphones cannot be calibrated from unknown directions: give --angles")
     middle = nominal_m.mean(axis=0)
@@ -229,6 +245,23 @@ def calibrate(
         doubts=tuple(doubts),
         notes=notes,
     )
+
+
+def _steady(arrivals: Arrivals, most_s: float) -> np.ndarray:
+    """(frames,) whether a frame's delays are like those of the frames around it: a walker does not jump. None
+    is where half of them differ from their neighbours by more than `most_s`.
+
+    Wild frames must go before the fit: where only an arc was walked, they would fill the rest of the circle.
+    """
+    frames = len(arrivals.time_s)
+    near = np.arange(frames)[:, None] + np.arange(-BESIDE, BESIDE + 1)
+    there = (near >= 0) & (near < frames)
+    near = np.clip(near, 0, frames - 1)
+    there &= np.abs(arrivals.time_s[near] - arrivals.time_s[:, None]) <= BESIDE_S
+    around = np.where(there[:, :, None], arrivals.delay_s[near], np.nan)
+    off = np.abs(arrivals.delay_s - np.nanmedian(around, axis=1)).max(axis=1)
+    usual = float(np.median(off))
+    return np.asarray((off <= max(JUMP_S, 4.0 * usual)) & (there.sum(axis=1) >= 3) & (usual <= most_s))
 
 
 # --- the fit ------------------------------------------------------------------------------------------
@@ -600,14 +633,15 @@ def _sigmas(covariance: F64, positions: F64, speed_m_s: float, dimensions: int) 
 
 
 def _widest_gap(azimuth: F64) -> float:
-    """The widest arc without a direction, radians. Gaps narrower than a fiftieth of all frames do not count:
-    a single stray direction closes no gap."""
+    """The widest arc without a direction, radians, in steps of 5 degrees. A step that has less than a fifth
+    of its share counts as without: strays lie everywhere."""
     if len(azimuth) < LEAST_FRAMES:
         return 2.0 * math.pi
-    counts, _ = np.histogram(azimuth % (2.0 * math.pi), bins=72, range=(0.0, 2.0 * math.pi))
-    heard = np.flatnonzero(counts >= max(1.0, len(azimuth) / 72 / 20))
-    steps = np.diff(np.append(heard, heard[0] + 72)) - 1
-    return float(steps.max()) * 2.0 * math.pi / 72
+    steps = 72
+    counts, _ = np.histogram(azimuth % (2.0 * math.pi), bins=steps, range=(0.0, 2.0 * math.pi))
+    heard = np.flatnonzero(counts > 0.2 * len(azimuth) / steps)
+    empty = np.diff(np.append(heard, heard[0] + steps)) - 1
+    return float(empty.max()) * 2.0 * math.pi / steps
 
 
 def _undetermined(position_m: F64, delay_s: F64, gap: float, walk: Walk, heights: bool) -> list[str]:
