@@ -283,7 +283,7 @@ def fitted(heard: Heard, settings: Settings, walk: Walk) -> Calibration:
 
 
 def report(heard: Heard, found: Calibration, settings: Settings, walk: Walk) -> Iterator[str]:
-    """What was found, line by line."""
+    """What was found, line by line; where it is in doubt, how the walk went and no more."""
     used = int(np.sum(found.weight > 0.2))
     yield f"frames      {heard.frames}, usable {len(heard.arrivals.time_s)}, in agreement {used}"
     covered = 360.0 - math.degrees(found.gap_rad)
@@ -291,6 +291,8 @@ def report(heard: Heard, found: Calibration, settings: Settings, walk: Walk) -> 
     sense = "clockwise" if found.turned_rad > 0.0 else "anticlockwise"
     given = "known" if walk.angles is not None else "unknown"
     yield f"directions  {given}, over {covered:.0f} of 360 degrees, {turns:.1f} turns {sense}"
+    if found.doubts:
+        return
     yield f"scale       ±{100 * found.scale_sigma:.2f} %, {_scale(found, settings, walk)}"
     yaw = f"rotation    ±{math.degrees(found.yaw_sigma_rad):.1f}°"
     if walk.angles is not None:

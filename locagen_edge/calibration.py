@@ -182,8 +182,8 @@ def calibrate(
     steady = _steady(arrivals, MOST_JUMP * MicArray(nominal_m).longest_delay_s(speed_m_s))
     if np.sum(steady) < LEAST_FRAMES:
         raise CalibrationError(
-            f"the delays jump about: {np.sum(steady)} of {frames} frames are like those before and after them: "
-            "see that one sound goes round, louder than all others and their echoes"
+            f"the delays jump about: {np.sum(steady)} of {frames} frames are like those before and after "
+            "them: see that one sound goes round, louder than all others and their echoes"
         )
     arrivals = Arrivals(*(a[steady] for a in (arrivals.delay_s, arrivals.covariance_s2, arrivals.time_s)))
     walk = walk if walk.angles is None else replace(walk, angles=walk.angles[steady])
