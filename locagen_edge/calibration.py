@@ -192,8 +192,7 @@ def calibrate(
     middle = nominal_m.mean(axis=0)
     nominal = nominal_m - middle
     problem = _Problem(arrivals, nominal, speed_m_s, walk)
-    fits = [problem.solved(start) for start in problem.starts()]
-    fit = min(fits, key=lambda f: f.cost)
+    fit = problem.best([problem.solved(start) for start in problem.starts()])
     doubts: list[str] = []
     if walk.angles is None:
         fit, shape_doubts = _oriented(fit, nominal, speed_m_s, walk.clockwise)
@@ -201,26 +200,21 @@ def calibrate(
 
     positions = _positions(fit.slope, speed_m_s, nominal)
     covariance, misfit, weight = problem.covariance(fit)
-    if math.isinf(walk.distance_m):
-        # the same frames, taken for near ones
-        near = _Problem(arrivals, nominal, speed_m_s, replace(walk, distance_m=NEAREST_M)).solved(fit)
-        nearby = _positions(near.slope, speed_m_s, nominal)
-        nearby[:, :2] = nearby[:, :2] @ _rotation(aligning_angle(nearby[:, :2], positions[:, :2]))
-        bent = nearby - positions, np.concatenate([[0.0], near.offset - fit.offset])
-    else:
-        bent = np.zeros_like(positions), np.zeros(others + 1)
     scale = _scale_sigma(temperature_c, walk)
     position_sigma, delay_sigma, yaw = _sigmas(covariance, positions, speed_m_s, fit.slope.shape[1])
     if walk.angles is None:  # from the nominal positions
         yaw = _loose_m(positions, nominal, tolerance_m) / math.sqrt(float(np.sum(nominal[:, :2] ** 2)))
     sine = math.sin(walk.elevation_rad) if not problem.heights else 0.0
     delay_sigma[1:] = np.hypot(delay_sigma[1:], math.sqrt(2.0) * tolerance_m * abs(sine) / speed_m_s)
+    if math.isinf(walk.distance_m):
+        near = _Problem(arrivals, nominal, speed_m_s, replace(walk, distance_m=NEAREST_M)).solved(fit)
+        moved, later = _apart(near, fit, nominal, speed_m_s)
+        position_sigma, delay_sigma = np.hypot(position_sigma, moved), np.hypot(delay_sigma, later)
     gap = _widest_gap(fit.azimuth[weight > 0.2])
     doubts += _undetermined(position_sigma, delay_sigma, gap, walk, problem.heights)
     notes = _elsewhere(positions, nominal) if walk.angles is not None else ()
     if not notes:
         doubts += _unlike(positions, nominal)
-    position_sigma, delay_sigma = np.hypot(position_sigma, bent[0]), np.hypot(delay_sigma, bent[1])
     measured = 3 if problem.heights else 2
     position_sigma[:, :measured] = np.hypot(position_sigma[:, :measured], scale * positions[:, :measured])
     step = _wrapped(np.diff(fit.azimuth[weight > 0.2]))
@@ -393,6 +387,11 @@ class _Problem:
         return fit
 
     # --- the steps
+
+    def best(self, fits: list[_Fit]) -> _Fit:
+        """The likeliest, all judged by the noise of the quietest."""
+        noise = min(self._noise(fit) for fit in fits)
+        return min(fits, key=lambda fit: self._priced(fit, noise).cost)
 
     def solved(self, fit: _Fit, steps: int = MOST_STEPS) -> _Fit:
         """Levenberg-Marquardt on all unknowns, the azimuths eliminated."""
@@ -587,6 +586,13 @@ def _swapped(points: F64, nominal: F64, *, mirror: bool) -> list[str]:
     ]
 
 
+def _apart(one: _Fit, other: _Fit, nominal: F64, speed_m_s: float) -> tuple[F64, F64]:
+    """By how much two fits differ: positions (mics, 3) after the best rotation, metres; delays (mics,), s."""
+    ours, theirs = (_positions(fit.slope, speed_m_s, nominal) for fit in (one, other))
+    ours[:, :2] = ours[:, :2] @ _rotation(aligning_angle(ours[:, :2], theirs[:, :2]))
+    return ours - theirs, np.concatenate([[0.0], one.offset - other.offset])
+
+
 # --- judgement ----------------------------------------------------------------------------------------
 
 
@@ -646,6 +652,12 @@ def _widest_gap(azimuth: F64) -> float:
 
 def _undetermined(position_m: F64, delay_s: F64, gap: float, walk: Walk, heights: bool) -> list[str]:
     found = []
+    if walk.angles is None and math.degrees(gap) > WIDEST_GAP_DEG:
+        found.append(
+            f"could not determine positions and delays: the sound covers {360 - math.degrees(gap):.0f} "
+            f"degrees of the horizon, and from unknown directions {360 - WIDEST_GAP_DEG:.0f} are needed: "
+            "walk all the way round, or give --angles"
+        )
     worst = float(position_m[:, : 3 if heights else 2].max())
     if not worst <= MOST_POSITION_M:
         found.append(f"could not determine the positions: 1-sigma {1e3 * worst:.1f} mm, at most 1 is useful")
@@ -653,12 +665,6 @@ def _undetermined(position_m: F64, delay_s: F64, gap: float, walk: Walk, heights
     if not late <= MOST_DELAY_S:
         found.append(
             f"could not determine the channels' delays: 1-sigma {1e6 * late:.1f} us, at most 3 is useful"
-        )
-    if walk.angles is None and math.degrees(gap) > WIDEST_GAP_DEG:
-        found.append(
-            f"could not determine positions and delays: the sound covers {360 - math.degrees(gap):.0f} "
-            f"degrees of the horizon, and from unknown directions {360 - WIDEST_GAP_DEG:.0f} are needed: "
-            "walk all the way round, or give --angles"
         )
     return found
 
