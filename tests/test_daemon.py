@@ -29,7 +29,7 @@ from locagen_edge.geometry import wrap
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.framer import Framer
 from locagen_edge.settings import Settings, from_table
-from locagen_edge.types import Frame
+from locagen_edge.types import Frame, Pose
 
 Sources = Callable[[Settings], AsyncGenerator[Frame, None]]
 
@@ -135,10 +135,10 @@ def test_a_pipeline_that_is_too_slow_drops_the_oldest_and_counts():
             await until(lambda: daemon.counters.estimates > 3)
             process, seen = daemon.pipeline.process, []
 
-            def slow(frame: Frame):
+            def slow(frame: Frame, pose: Pose):
                 time.sleep(0.03)
                 seen.append(frame.t_ns)
-                return process(frame)
+                return process(frame, pose)
 
             daemon.pipeline.process = slow
             await until(lambda: daemon.counters.dropped > 20)
@@ -364,7 +364,7 @@ def test_a_stuck_pipeline_is_not_taken_for_health(monkeypatch, tmp_path):
             await daemon.startup()
             await until(lambda: daemon.counters.estimates > 3)
             release = threading.Event()
-            daemon.pipeline.process = lambda _: release.wait(WITHIN_S)
+            daemon.pipeline.process = lambda *_: release.wait(WITHIN_S)
             await until(lambda: not daemon.hearing)
             with contextlib.suppress(BlockingIOError):
                 while True:

@@ -1,0 +1,235 @@
+"""Callers over time: birth, confirmation, coasting and death.
+
+Where the vehicle's attitude is known at a frame's middle, callers are followed in the earth's axes: a drone
+that turns under way does not move them, and what is heard adds up. Elsewhere they are followed as the body
+sees them. When the attitude comes or goes, every track is turned into the other axes and lives on.
+
+A bearing within no track's gate begins a track, which counts as confirmed when it was heard again in
+`CONFIRM_HEARD` of the first `CONFIRM_OF` frames with a bearing, and is dropped otherwise: M of N (Bar-Shalom,
+Willett & Tian, *Tracking and Data Fusion*, section 3.4).
+
+Errors of the microphones' positions and of the attitude are the same in every frame and do not average out:
+they are kept out of the filter's shrinking and added to the sigma that is told.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from locagen_edge.geometry import angles, rotation
+from locagen_edge.settings import TrackSettings
+from locagen_edge.stages.track import filter as sphere
+from locagen_edge.stages.track.association import associate
+from locagen_edge.types import F64, Bearing, Detection, Quaternion, Track, TrueBearing
+
+GATE_SIGMA = 4.0
+CONFIRM_HEARD, CONFIRM_OF = 3, 5
+"""0.15 s of sound at the default hop. A bearing from nowhere is followed by two more within its gates in 3 %
+of all cases."""
+CONFIDENCE_S = 0.5
+"""Time constant of the share of frames that agree."""
+BEST_STAYS_S = 0.25
+"""The best track stays it while it is heard this often: of two who call at once, one is not told now and the
+other then."""
+ALIKE_SIGMA = 2.0
+ALIKE_RAD = math.radians(10.0)
+"""Two tracks closer than both are one caller, unless one frame had a bearing for each."""
+SWELL_S = 0.02
+"""1-sigma of the moment within a frame of 0.1 s from which most of its sound comes."""
+NOWHERE_RAD = math.pi / math.sqrt(3.0)
+"""1-sigma of an angle that may be anything."""
+
+
+@dataclass(slots=True)
+class _Caller:
+    """A track in the making."""
+
+    id: int
+    state: sphere.State
+    elevation_known: bool
+    age_s: float = 0.0
+    silent_s: float = 0.0
+    confidence: float = 0.0
+    heard: int = 1
+    chances: int = 1
+    """frames with a bearing since birth, and in how many of them it was this track's"""
+    confirmed: bool = False
+
+    @property
+    def given_up(self) -> bool:
+        return not self.confirmed and self.chances - self.heard > CONFIRM_OF - CONFIRM_HEARD
+
+    @property
+    def rank(self) -> tuple[bool, bool, float, float]:
+        return self.confirmed, self.silent_s < BEST_STAYS_S, self.confidence, self.age_s
+
+
+class Tracker:
+    """Follows the callers of one stream.
+
+    `tolerance_rad`: 1-sigma of a bearing from the microphones' positions. `overlap`: frame over hop; frames
+    that overlap share their noise, so that each brings less than its sigma says.
+    """
+
+    def __init__(self, settings: TrackSettings, tolerance_rad: float, overlap: float):
+        self._settings = settings
+        self._fixed = tolerance_rad**2
+        self._inflation = max(0.75 * overlap, 1.0)  # 1.5 at half overlap: Hann frames correlate by 1/6
+        self._motions = {False: sphere.body_motion(settings), True: sphere.earth_motion(settings)}
+        self._turn: F64 | None = None  # body -> earth, of the last frame
+        self._callers: list[_Caller] = []  # the best first
+        self._ids = itertools.count(1)
+
+    def __call__(
+        self,
+        bearings: tuple[Bearing, ...],
+        detection: Detection,
+        elapsed_s: float,
+        attitude: Quaternion | None = None,
+    ) -> tuple[Track, ...]:
+        """All tracks after this frame, the best first. `bearings`: of the sources in it, the strongest first;
+        `elapsed_s`: since the previous frame; `attitude`: at the frame's middle."""
+        turned_rad = self._predict(elapsed_s, None if attitude is None else rotation(attitude))
+        heard = [b for b in bearings if b.azimuth_rad is not None] if detection.call else []
+        if heard:
+            rate = turned_rad / elapsed_s if elapsed_s > 0.0 else 0.0
+            self._hear(heard[: self._settings.most], (rate * SWELL_S) ** 2, elapsed_s)
+        self._order()
+        return tuple(self._told(caller) for caller in self._callers)
+
+    @property
+    def _motion(self) -> sphere.Motion:
+        return self._motions[self._turn is not None]
+
+    # --- time goes on
+
+    def _predict(self, dt: float, turn: F64 | None) -> float:
+        """To the next frame, and into its axes. Returns by how much the vehicle turned, where known."""
+        before = self._turn
+        if before is not None and turn is None:
+            self._turn = None
+            self._change_axes(before.T)
+        for caller in self._callers:
+            caller.state = sphere.predicted(caller.state, self._motion, dt)
+            caller.age_s += dt
+            caller.silent_s += dt
+            caller.confidence *= math.exp(-dt / CONFIDENCE_S)
+        self._callers = [c for c in self._callers if c.silent_s <= self._settings.coast_s]
+        self._turn = turn
+        if turn is None:
+            return 0.0
+        if before is None:
+            self._change_axes(turn)
+            return 0.0
+        return math.acos(min(max((float(np.trace(before.T @ turn)) - 1.0) / 2.0, -1.0), 1.0))
+
+    def _change_axes(self, turn: F64) -> None:
+        for caller in self._callers:
+            caller.state = sphere.in_other_axes(caller.state, turn, self._motion)
+
+    # --- what is heard
+
+    def _hear(self, bearings: list[Bearing], moved: float, dt: float) -> None:
+        turn = np.eye(3) if self._turn is None else self._turn
+        measurements = [
+            sphere.measured(b, turn, fixed=self._fixed, inflation=self._inflation, moved=moved)
+            for b in bearings
+        ]
+        innovations = [[sphere.innovation(c.state, m) for c in self._callers] for m in measurements]
+        costs = [[i.cost if i.distance2 <= GATE_SIGMA**2 else math.inf for i in row] for row in innovations]
+        for caller in self._callers:
+            caller.chances += 1
+        pairing = associate(costs)
+        agreed = 1.0 - math.exp(-dt / CONFIDENCE_S)
+        for number, place in enumerate(pairing):
+            if place is not None:
+                caller = self._callers[place]
+                caller.state = sphere.updated(caller.state, innovations[number][place], self._motion)
+                caller.elevation_known |= measurements[number].elevation is not None
+                caller.silent_s = 0.0
+                caller.heard += 1
+                caller.confirmed |= caller.heard >= CONFIRM_HEARD
+                caller.confidence += agreed
+        self._callers = [caller for caller in self._callers if not caller.given_up]
+        self._merge()
+        for m, row in zip(measurements, costs, strict=True):
+            if all(math.isinf(cost) for cost in row):  # in the gate of another's: one caller heard twice
+                self._callers.append(self._born(m, agreed))
+
+    def _born(self, m: sphere.Measurement, agreed: float) -> _Caller:
+        if len(self._callers) >= self._settings.most:
+            self._callers.remove(min(self._callers, key=lambda caller: caller.rank))
+        state = sphere.born(m, self._motion)
+        return _Caller(next(self._ids), state, m.elevation is not None, confidence=agreed)
+
+    def _merge(self) -> None:
+        """Of two tracks of one caller, the surer stays."""
+        for a, b in itertools.combinations(sorted(self._callers, key=lambda c: c.rank, reverse=True), 2):
+            if max(a.silent_s, b.silent_s) > 0.0 and self._alike(a.state, b.state):
+                self._callers = [caller for caller in self._callers if caller is not b]
+
+    def _alike(self, a: sphere.State, b: sphere.State) -> bool:
+        off = math.acos(min(max(float(a.u @ b.u), -1.0), 1.0))
+        if off > ALIKE_RAD:
+            return False
+        across = b.u - a.u
+        across /= max(float(np.linalg.norm(across)), 1e-12)
+        variance = float(across @ (a.p[:3, :3] + b.p[:3, :3]) @ across) + self._fixed
+        return off <= ALIKE_SIGMA * math.sqrt(variance)
+
+    def _order(self) -> None:
+        """The best first; it stays while it is heard."""
+        if not self._callers:
+            return
+        best = self._callers[0]
+        self._callers.sort(key=lambda caller: caller.rank, reverse=True)
+        if best.confirmed and best.silent_s < BEST_STAYS_S:
+            self._callers.remove(best)
+            self._callers.insert(0, best)
+
+    # --- what is told
+
+    def _told(self, caller: _Caller) -> Track:
+        turn = np.eye(3) if self._turn is None else self._turn
+        azimuth, azimuth_sigma, elevation, elevation_sigma = self._seen(caller, turn.T)
+        return Track(
+            azimuth_rad=azimuth,
+            azimuth_sigma_rad=azimuth_sigma,
+            elevation_rad=elevation,
+            elevation_sigma_rad=elevation_sigma,
+            age_s=caller.age_s,
+            silent_s=caller.silent_s,
+            confidence=min(caller.confidence, 1.0),
+            id=caller.id,
+            confirmed=caller.confirmed,
+            earth=None if self._turn is None else self._in_earth(caller),
+        )
+
+    def _in_earth(self, caller: _Caller) -> TrueBearing:
+        compass, tilt = math.radians(self._settings.compass_deg), math.radians(self._settings.tilt_deg)
+        _, slope = angles(caller.state.u)
+        # leaning by a wrong angle moves what is below sideways, and what is level up and down
+        azimuth, azimuth_sigma, elevation, elevation_sigma = self._seen(
+            caller, np.eye(3), level=(tilt * math.sin(slope)) ** 2, up=tilt**2
+        )
+        azimuth_sigma = min(math.hypot(azimuth_sigma, compass), NOWHERE_RAD)
+        return TrueBearing(azimuth, azimuth_sigma, elevation, elevation_sigma)
+
+    def _seen(
+        self, caller: _Caller, turn: F64, level: float = 0.0, up: float = 0.0
+    ) -> tuple[float, float, float | None, float]:
+        """Azimuth, elevation and their sigmas in the axes that `turn` leads to; `level` and `up` are
+        variances on top, rad^2 across the direction."""
+        u = turn @ caller.state.u
+        azimuth, elevation = angles(u)
+        across = sphere.tangent(u) @ turn
+        variance = np.diag(across @ caller.state.p[:3, :3] @ across.T) + self._fixed
+        azimuth_sigma = math.sqrt(variance[0] + level) / max(math.cos(elevation), 1e-9)
+        if not caller.elevation_known:
+            return azimuth, min(azimuth_sigma, NOWHERE_RAD), None, NOWHERE_RAD
+        elevation_sigma = min(math.sqrt(variance[1] + up), NOWHERE_RAD)
+        return azimuth, min(azimuth_sigma, NOWHERE_RAD), elevation, elevation_sigma
