@@ -291,9 +291,9 @@ class TrackSettings:
         most=1000,
     )
     agility_earth_deg_s2: float = setting(
-        3.0,
-        "The same where the attitude is known, and only flying past a caller changes a bearing: 3 is 10 m/s "
-        "past a caller 30 m away.",
+        2.0,
+        "The same where the attitude is known, and only flying past a caller changes a bearing: 2 is for "
+        "10 m/s past a caller 30 m away.",
         unit="degrees/s2",
         least=0.1,
         most=1000,

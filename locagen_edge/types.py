@@ -1,6 +1,6 @@
 """What travels along the way, in the order of travel.
 
-    Frame -> Correlation -> Tdoa -> Bearing -> Track        (Detection and faults beside them)
+    Frame -> Correlation -> Tdoa -> Bearing -> Track        (Detection, Pose and faults beside them)
 
 Each type carries its own time and rate, so that no stage has to ask another for them. All are frozen;
 arrays inside are not to be written to. Conventions of axes, signs and units: CONTRIBUTING.md.

@@ -136,8 +136,10 @@ class PoseHistory:
         boot_ms = getattr(message, "time_boot_ms", 0) or None  # 0: who sent it knows no time
         if boot_ms is not None and self._clock.hear(float(boot_ms), arrived_ns):
             self.reboots += 1
-            for history in (self._attitude, self._position, *self._heights.values()):
-                history.clear()
+            self._attitude.clear()
+            self._position.clear()
+            for height in self._heights.values():
+                height.clear()
         at_ms = self._clock.boot_ms(arrived_ns) if boot_ms is None else float(boot_ms)
         if at_ms is None:
             return

@@ -60,7 +60,7 @@ class Motion:
 
 def body_motion(settings: TrackSettings) -> Motion:
     """The drone yaws as briskly as the settings say, and leans; the caller's own way is slow beside that."""
-    return Motion(math.radians(settings.agility_deg_s2), math.radians(30.0), math.radians(3.0), False)
+    return Motion(math.radians(settings.agility_deg_s2), math.radians(30.0), math.radians(5.0), False)
 
 
 def earth_motion(settings: TrackSettings) -> Motion:
@@ -115,7 +115,7 @@ def tangent(u: F64) -> F64:
     """(2, 3): across a direction, level with the horizon (clockwise) and towards the zenith."""
     flat = math.hypot(u[0], u[1])
     level = np.array([-u[1], u[0], 0.0]) / flat if flat > 1e-9 else np.array([0.0, 1.0, 0.0])
-    return np.stack([level, np.cross(level, u)])
+    return np.stack([level, _cross(level) @ u])
 
 
 def born(m: Measurement, motion: Motion) -> State:
@@ -239,7 +239,7 @@ def _turn(v: F64) -> F64:
 
 def _carry(a: F64, b: F64) -> F64:
     """(3, 3) the shortest rotation from unit vector a to b: carries what is tangent at a to b."""
-    k = _cross(np.cross(a, b))
+    k = _cross(_cross(a) @ b)
     rotated: F64 = np.eye(3) + k + k @ k / max(1.0 + float(a @ b), 1e-9)
     return rotated
 

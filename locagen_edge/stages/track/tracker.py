@@ -26,7 +26,9 @@ from locagen_edge.stages.track import filter as sphere
 from locagen_edge.stages.track.association import associate
 from locagen_edge.types import F64, Bearing, Detection, Quaternion, Track, TrueBearing
 
-GATE_SIGMA = 4.0
+GATE2 = (16.0, 19.4)
+"""Squared Mahalanobis distance of one and of two components beyond which a bearing is none of this track's:
+4 sigma, 1 in 16,000."""
 CONFIRM_HEARD, CONFIRM_OF = 3, 5
 """0.15 s of sound at the default hop. A bearing from nowhere is followed by two more within its gates in 3 %
 of all cases."""
@@ -37,7 +39,8 @@ BEST_STAYS_S = 0.25
 other then."""
 ALIKE_SIGMA = 2.0
 ALIKE_RAD = math.radians(10.0)
-"""Two tracks closer than both are one caller, unless one frame had a bearing for each."""
+"""Two tracks closer than both are one caller; heard in one frame, closer than the second: an array of 10 cm
+does not tell such two apart."""
 SWELL_S = 0.02
 """1-sigma of the moment within a frame of 0.1 s from which most of its sound comes."""
 NOWHERE_RAD = math.pi / math.sqrt(3.0)
@@ -97,7 +100,7 @@ class Tracker:
         heard = [b for b in bearings if b.azimuth_rad is not None] if detection.call else []
         if heard:
             rate = turned_rad / elapsed_s if elapsed_s > 0.0 else 0.0
-            self._hear(heard[: self._settings.most], (rate * SWELL_S) ** 2, elapsed_s)
+            self._hear(heard, (rate * SWELL_S) ** 2, elapsed_s)
         self._order()
         return tuple(self._told(caller) for caller in self._callers)
 
@@ -140,7 +143,9 @@ class Tracker:
             for b in bearings
         ]
         innovations = [[sphere.innovation(c.state, m) for c in self._callers] for m in measurements]
-        costs = [[i.cost if i.distance2 <= GATE_SIGMA**2 else math.inf for i in row] for row in innovations]
+        costs = [
+            [i.cost if i.distance2 <= GATE2[len(i.off) - 1] else math.inf for i in row] for row in innovations
+        ]
         for caller in self._callers:
             caller.chances += 1
         pairing = associate(costs)
@@ -157,25 +162,32 @@ class Tracker:
         self._callers = [caller for caller in self._callers if not caller.given_up]
         self._merge()
         for m, row in zip(measurements, costs, strict=True):
-            if all(math.isinf(cost) for cost in row):  # in the gate of another's: one caller heard twice
-                self._callers.append(self._born(m, agreed))
+            # left over within a gate: one caller heard twice
+            if all(math.isinf(cost) for cost in row) and self._make_room():
+                state = sphere.born(m, self._motion)
+                known = m.elevation is not None
+                self._callers.append(_Caller(next(self._ids), state, known, confidence=agreed))
 
-    def _born(self, m: sphere.Measurement, agreed: float) -> _Caller:
-        if len(self._callers) >= self._settings.most:
-            self._callers.remove(min(self._callers, key=lambda caller: caller.rank))
-        state = sphere.born(m, self._motion)
-        return _Caller(next(self._ids), state, m.elevation is not None, confidence=agreed)
+    def _make_room(self) -> bool:
+        """Whether one more can be followed; a confirmed caller who is heard now gives way to nobody."""
+        if len(self._callers) < self._settings.most:
+            return True
+        weakest = min(self._callers, key=lambda caller: caller.rank)
+        if weakest.confirmed and weakest.silent_s < BEST_STAYS_S:
+            return False
+        self._callers.remove(weakest)
+        return True
 
     def _merge(self) -> None:
         """Of two tracks of one caller, the surer stays."""
         for a, b in itertools.combinations(sorted(self._callers, key=lambda c: c.rank, reverse=True), 2):
-            if max(a.silent_s, b.silent_s) > 0.0 and self._alike(a.state, b.state):
+            if self._alike(a.state, b.state, at_once=a.silent_s == b.silent_s == 0.0):
                 self._callers = [caller for caller in self._callers if caller is not b]
 
-    def _alike(self, a: sphere.State, b: sphere.State) -> bool:
+    def _alike(self, a: sphere.State, b: sphere.State, *, at_once: bool) -> bool:
         off = math.acos(min(max(float(a.u @ b.u), -1.0), 1.0))
-        if off > ALIKE_RAD:
-            return False
+        if off > ALIKE_RAD or at_once:
+            return off <= ALIKE_RAD
         across = b.u - a.u
         across /= max(float(np.linalg.norm(across)), 1e-12)
         variance = float(across @ (a.p[:3, :3] + b.p[:3, :3]) @ across) + self._fixed
