@@ -20,6 +20,9 @@ KELVIN = 273.15
 LAG_MARGIN_SAMPLES = 0.25
 """Noise moves the peak of a source in line with a pair beyond the longest delay: look a little further."""
 
+FLAT_M = 1e-4
+"""Thinner than this an array is flat: 0.1 mm is 0.3 us, a tenth of what a frame's noise leaves."""
+
 
 def speed_of_sound(temperature_c: float) -> float:
     """Speed of sound in dry air, m/s: 331.3 sqrt(1 + T / 273.15).
@@ -149,6 +152,18 @@ class MicArray:
         """(pairs,): distance between the two microphones."""
         distance: F64 = np.linalg.norm(self.baselines_m, axis=1)
         return distance
+
+    @cached_property
+    def normal(self) -> F64 | None:
+        """(3,) unit vector across a flat array, downwards: it hears a sound and its mirror image alike.
+
+        None for one that is not flat, or on one line.
+        """
+        _, extent, axes = np.linalg.svd(self.baselines_m)
+        if len(extent) < 3 or extent[1] < FLAT_M or extent[2] > FLAT_M:
+            return None
+        across: F64 = axes[2] * (1.0 if axes[2, 2] >= 0.0 else -1.0)
+        return across
 
     def longest_delay_s(self, speed_m_s: float) -> float:
         """The longest delay that any pair can see, seconds."""

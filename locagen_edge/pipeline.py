@@ -34,7 +34,10 @@ class Pipeline:
         self._detect = Detector(settings.detection)
         self._find_faults = FaultFinder()
         self._track = Tracker(
-            settings.track, tolerance_rad(array, settings.array.tolerance_m), audio.frame / audio.hop
+            settings.track,
+            tolerance_rad(array, settings.array.tolerance_m),
+            audio.frame / audio.hop,
+            array.normal,
         )
         self._last_ns: int | None = None
 

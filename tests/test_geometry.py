@@ -75,6 +75,21 @@ def test_triangle_has_its_sides_and_order():
     assert array.longest_delay_s(343.0) * 10_000 == pytest.approx(2.915, abs=1e-3)
 
 
+@given(ANGLE, st.floats(-1.5, 1.5))
+def test_a_flat_array_hears_a_sound_and_its_mirror_image_alike(azimuth, elevation):
+    array = MicArray(equilateral().positions_m @ rotation(quaternion(0.3, -0.2, 1.0)).T)
+    u = direction(azimuth, elevation)
+    image = u - 2 * (u @ array.normal) * array.normal
+    np.testing.assert_allclose(array.delays_s(u, 343.0), array.delays_s(image, 343.0), atol=1e-15)
+    assert array.normal[2] > 0.0
+
+
+def test_other_arrays_have_no_mirror():
+    assert MicArray(np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.01]])).normal is None
+    assert MicArray(np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])).normal is None
+    assert MicArray(np.array([[0.0, 0, 0], [0.1, 0, 0]])).normal is None
+
+
 @pytest.mark.parametrize(("temperature_c", "speed"), [(0.0, 331.3), (20.0, 343.2), (-20.0, 318.9)])
 def test_speed_of_sound(temperature_c, speed):
     assert speed_of_sound(temperature_c) == pytest.approx(speed, abs=0.1)

@@ -4,6 +4,7 @@ callers, and the earth's axes under a drone that turns."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,15 +58,15 @@ def test_it_is_born_with_the_first_call():
 
 
 def test_sigma_shrinks_with_evidence_and_is_true():
-    """200 runs of 40 bearings of a fixed caller: normalised error squared has mean 1 (+-0.3 at 3 sigma,
+    """100 runs of 40 bearings of a fixed caller: normalised error squared has mean 1 (+-0.42 at 3 sigma,
     below 1 since a fixed caller is more docile than the model)."""
     rng, score = np.random.default_rng(5), []
-    for _ in range(200):
+    for _ in range(100):
         tracks = run(tracker(), [heard(100.0 + 2.0 * rng.standard_normal()) for _ in range(40)])
         last = tracks[-1]
         assert last.azimuth_sigma_rad < math.radians(1.2)
         score.append((error_deg(last, 100.0) / math.degrees(last.azimuth_sigma_rad)) ** 2)
-    assert 0.4 < np.mean(score) < 1.3
+    assert 0.3 < np.mean(score) < 1.3
 
 
 def test_it_goes_through_north_without_a_jump():
@@ -253,13 +254,13 @@ def true_off_deg(track: Track, azimuth_deg: float) -> float:
 @pytest.mark.parametrize("rate_deg_s", [0.0, 30.0, -60.0])
 @pytest.mark.parametrize("elevation_deg", [-5.0, -45.0, -75.0])
 def test_a_caller_who_stands_still_under_a_turning_drone_does_so_in_the_track(rate_deg_s, elevation_deg):
-    """20 runs. The mean error, which would be a lag, is within 3.3 sigma of nothing; the sigma shrinks to
+    """12 runs. The mean error, which would be a lag, is within 3.3 sigma of nothing; the sigma shrinks to
     half of one bearing's (with what the drone turns between the frame's middle and the loudest moment of its
     sound), and tells the spread."""
     rng, offs, sigmas = np.random.default_rng(7), [], []
-    for _ in range(20):
+    for _ in range(12):
         t = tracker(compass_deg=0.0, tilt_deg=0.0)
-        for frame in range(80):
+        for frame in range(60):
             attitude = turning(frame, rate_deg_s)
             track, *_ = t((seen(200.0, elevation_deg, attitude, rng),), CALL, HOP_S, attitude)
             if frame in (0, 5, 20):
@@ -270,8 +271,30 @@ def test_a_caller_who_stands_still_under_a_turning_drone_does_so_in_the_track(ra
     assert early > later > last
     across = last * math.cos(math.radians(elevation_deg))
     assert across < 0.5 * math.hypot(2.0, SWELL_S * rate_deg_s)
-    assert abs(np.mean(offs)) < 3.3 * across / math.sqrt(20)
+    assert abs(np.mean(offs)) < 3.3 * across / math.sqrt(12)
     assert 0.4 * across < np.std(offs) < 1.4 * across  # stiller than the model: rather less than it says
+
+
+def test_true_bearings_are_as_far_off_as_they_say_with_a_compass_and_a_horizon_that_are_wrong():
+    """120 vehicles, each with a heading (3 degrees) and a horizon (1 degree) of its own error, 40 bearings:
+    normalised errors squared have the mean 1, +-0.43 at 3.3 sigma of 120; rather less, since the caller
+    stands stiller than the model."""
+    rng, azimuths, elevations = np.random.default_rng(12), [], []
+    for _ in range(120):
+        t = tracker(compass_deg=3.0, tilt_deg=1.0)
+        wrong = rotation(
+            quaternion(*np.radians(rng.standard_normal(2)), math.radians(3.0) * rng.standard_normal())
+        )
+        for frame in range(40):
+            attitude = turning(frame, 20.0)
+            caller = wrong @ direction(math.radians(120.0), math.radians(-40.0))
+            there = [math.degrees(angle) for angle in angles(caller)]
+            track, *_ = t((seen(*there, attitude, rng),), CALL, HOP_S, attitude)
+        azimuths.append(true_off_deg(track, 120.0) / math.degrees(track.earth.azimuth_sigma_rad))
+        off = track.earth.elevation_rad - math.radians(-40.0)
+        elevations.append(off / track.earth.elevation_sigma_rad)
+    for scores in (azimuths, elevations):
+        assert 0.5 < np.mean(np.square(scores)) < 1.43
 
 
 def test_what_the_body_sees_turns_with_it_and_is_surer_than_the_compass():
@@ -365,6 +388,30 @@ def test_flying_past_a_caller_does_not_make_it_lag():
     assert abs(np.mean(offs[20:])) < 0.5
 
 
+def lower(bearing: Bearing) -> Bearing:
+    """What a level flat array makes of it."""
+    return replace(bearing, elevation_rad=-abs(bearing.elevation_rad))
+
+
+@pytest.mark.parametrize("mirrors", [True, False])
+def test_a_caller_near_the_horizon_stays_where_it_is_when_a_drone_with_a_flat_array_leans(mirrors):
+    """10 degrees below the horizon ahead, the nose goes down by up to 30: the body has the caller above its
+    own horizon, and the array puts it 40 degrees below the true one. Who does not know that loses it."""
+    rng, ids, offs = np.random.default_rng(11), set(), []
+    normal = np.array([0.0, 0.0, 1.0]) if mirrors else None
+    t = Tracker(TrackSettings(), 0.0, 1.0, normal)
+    for frame in range(150):
+        attitude = quaternion(0.0, math.radians(-15.0 + 15.0 * math.cos(frame * HOP_S)), 0.0)
+        tracks = t((lower(seen(5.0, -10.0, attitude, rng)),), CALL, HOP_S, attitude)
+        ids |= {track.id for track in tracks if track.confirmed}
+        offs.append(math.degrees(tracks[0].earth.elevation_rad) + 10.0)
+    if mirrors:
+        assert ids == {1}
+        assert np.abs(offs[10:]).max() < 6.0  # where the two answers meet, they push each other apart
+    else:
+        assert np.abs(offs).max() > 20.0
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     st.lists(
@@ -372,7 +419,9 @@ def test_flying_past_a_caller_does_not_make_it_lag():
             st.none() | st.tuples(*[st.floats(-7, 7)] * 3),
             st.lists(
                 st.tuples(
-                    st.none() | st.floats(-180, 180), st.floats(0, 104), st.none() | st.floats(-90, 90)
+                    st.none() | st.floats(-180, 180) | st.just(math.nan),
+                    st.floats(0, 104) | st.sampled_from([math.nan, math.inf]),
+                    st.none() | st.floats(-90, 90) | st.just(math.nan),
                 ),
                 max_size=3,
             ),

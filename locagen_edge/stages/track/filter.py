@@ -111,6 +111,13 @@ def measured(bearing: Bearing, turn: F64, *, fixed: float, inflation: float, mov
     return Measurement(turn, bearing.azimuth_rad, bearing.elevation_rad, noise(level), noise(up), fixed)
 
 
+def mirrored(m: Measurement, normal: F64) -> Measurement:
+    """The other answer of a flat array with this normal (body axes): as good as the first in every delay."""
+    u = direction(m.azimuth, m.elevation or 0.0)
+    azimuth, elevation = angles(u - 2.0 * float(u @ normal) * normal)
+    return replace(m, azimuth=azimuth, elevation=elevation)
+
+
 def tangent(u: F64) -> F64:
     """(2, 3): across a direction, level with the horizon (clockwise) and towards the zenith."""
     flat = math.hypot(u[0], u[1])

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from locagen_edge.geometry import angles, rotation
+from locagen_edge.geometry import angles, direction, rotation
 from locagen_edge.settings import TrackSettings
 from locagen_edge.stages.track import filter as sphere
 from locagen_edge.stages.track.association import associate
@@ -75,10 +75,15 @@ class Tracker:
     """Follows the callers of one stream.
 
     `tolerance_rad`: 1-sigma of a bearing from the microphones' positions. `overlap`: frame over hop; frames
-    that overlap share their noise, so that each brings less than its sigma says.
+    that overlap share their noise, so that each brings less than its sigma says. `normal` (3,) of a flat
+    array, body axes: of its two answers a bearing holds the lower as the body sees it, and on a drone that
+    leans, a caller near the horizon may be the other.
     """
 
-    def __init__(self, settings: TrackSettings, tolerance_rad: float, overlap: float):
+    def __init__(
+        self, settings: TrackSettings, tolerance_rad: float, overlap: float, normal: F64 | None = None
+    ):
+        self._normal = normal
         self._settings = settings
         self._fixed = tolerance_rad**2
         self._inflation = max(0.75 * overlap, 1.0)  # 1.5 at half overlap: Hann frames correlate by 1/6
@@ -97,7 +102,7 @@ class Tracker:
         """All tracks after this frame, the best first. `bearings`: of the sources in it, the strongest first;
         `elapsed_s`: since the previous frame; `attitude`: at the frame's middle."""
         turned_rad = self._predict(elapsed_s, None if attitude is None else rotation(attitude))
-        heard = [b for b in bearings if b.azimuth_rad is not None] if detection.call else []
+        heard = [b for b in bearings if _usable(b)] if detection.call else []
         if heard:
             rate = turned_rad / elapsed_s if elapsed_s > 0.0 else 0.0
             self._hear(heard, (rate * SWELL_S) ** 2, elapsed_s)
@@ -142,7 +147,7 @@ class Tracker:
             sphere.measured(b, turn, fixed=self._fixed, inflation=self._inflation, moved=moved)
             for b in bearings
         ]
-        innovations = [[sphere.innovation(c.state, m) for c in self._callers] for m in measurements]
+        innovations = [[self._nearest(c.state, m) for c in self._callers] for m in measurements]
         costs = [
             [i.cost if i.distance2 <= GATE2[len(i.off) - 1] else math.inf for i in row] for row in innovations
         ]
@@ -167,6 +172,16 @@ class Tracker:
                 state = sphere.born(m, self._motion)
                 known = m.elevation is not None
                 self._callers.append(_Caller(next(self._ids), state, known, confidence=agreed))
+
+    def _nearest(self, state: sphere.State, m: sphere.Measurement) -> sphere.Innovation:
+        """Against whichever answer is nearer, of those that are below the true horizon."""
+        first = sphere.innovation(state, m)
+        if self._normal is None or self._turn is None or m.elevation is None:
+            return first
+        other = sphere.mirrored(m, self._normal)
+        if (self._turn @ direction(other.azimuth, other.elevation or 0.0))[2] <= 0.0:
+            return first
+        return min(first, sphere.innovation(state, other), key=lambda i: i.cost)
 
     def _make_room(self) -> bool:
         """Whether one more can be followed; a confirmed caller who is heard now gives way to nobody."""
@@ -245,3 +260,13 @@ class Tracker:
             return azimuth, min(azimuth_sigma, NOWHERE_RAD), None, NOWHERE_RAD
         elevation_sigma = min(math.sqrt(variance[1] + up), NOWHERE_RAD)
         return azimuth, min(azimuth_sigma, NOWHERE_RAD), elevation, elevation_sigma
+
+
+def _usable(bearing: Bearing) -> bool:
+    """Whether it says anything; one NaN would stay in a track for ever."""
+    elevation = (
+        (0.0, 0.0) if bearing.elevation_rad is None else (bearing.elevation_rad, bearing.elevation_sigma_rad)
+    )
+    return bearing.azimuth_rad is not None and all(
+        map(math.isfinite, (bearing.azimuth_rad, bearing.azimuth_sigma_rad, *elevation))
+    )
