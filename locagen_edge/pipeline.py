@@ -35,6 +35,7 @@ class Pipeline:
         self._find_faults = FaultFinder()
         self._track = Tracker(
             settings.track,
+            settings.pose,
             tolerance_rad(array, settings.array.tolerance_m),
             audio.frame / audio.hop,
             array.normal,

@@ -304,13 +304,6 @@ class TrackSettings:
     most: int = setting(
         4, "Callers followed at a time; beyond that the weakest gives way.", unit="callers", least=1, most=8
     )
-    compass_deg: float = setting(
-        3.0,
-        "1-sigma of the vehicle's true heading, magnetic declination included. It goes into azimuths from "
-        "true north; those from the nose keep the smaller sigma.",
-        unit="degrees", least=0, most=90,
-    )  # fmt: skip
-    tilt_deg: float = setting(1.0, "The same of its roll and pitch.", unit="degrees", least=0, most=90)
 
 
 @dataclass(frozen=True)
@@ -332,6 +325,13 @@ class PoseSettings:
     position_limit_s: float = setting(
         1.0, "The same for position and heights.", unit="s", least=0.01, most=60
     )
+    compass_deg: float = setting(
+        3.0,
+        "1-sigma of the true heading, magnetic declination included. It goes into azimuths from true north; "
+        "those from the nose keep the smaller sigma.",
+        unit="degrees", least=0, most=90,
+    )  # fmt: skip
+    tilt_deg: float = setting(1.0, "The same of roll and pitch.", unit="degrees", least=0, most=90)
     relief_m: float = setting(
         15.0,
         "1-sigma of the ground's height against that of the take-off place. Counts where neither "

@@ -119,7 +119,8 @@ class Detection:
 
 @dataclass(frozen=True, slots=True)
 class TrueBearing:
-    """A direction in earth axes, with the error of the vehicle's attitude in its sigmas."""
+    """A direction in earth axes. The sigmas hold the error of the vehicle's attitude, unless it is said
+    otherwise."""
 
     azimuth_rad: float
     """clockwise from true north, -pi to pi"""
@@ -150,6 +151,9 @@ class Track:
     """heard often enough to be no chance"""
     earth: TrueBearing | None = None
     """None: the attitude is not known now, and the track is followed in body axes"""
+    look: TrueBearing | None = None
+    """this frame's own bearing of the caller, not smoothed, with the sigmas of its noise alone: what positions
+    are made of. None: not heard in this frame, or the attitude is not known"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -291,7 +291,7 @@ def test_bearings_are_the_vehicles_however_the_array_is_mounted(mount_deg, estim
 @pytest.mark.parametrize("rate_deg_s", [0.0, 45.0, -60.0])
 def test_a_caller_stands_still_in_the_earths_axes_under_a_drone_that_turns(rate_deg_s):
     """White sound from 200 degrees true, 30 below the horizon; the drone leans 6 degrees into its turn."""
-    settings = from_table({"detection": {"snr_db": -20}, "track": {"compass_deg": 0, "tilt_deg": 0}})
+    settings = from_table({"detection": {"snr_db": -20}, "pose": {"compass_deg": 0, "tilt_deg": 0}})
     pipeline, caller = Pipeline(settings), (math.radians(200.0), math.radians(-30.0))
     quiet = 1e-3 * np.random.default_rng(0).standard_normal((3, 40_000)).astype(np.float32)
     for frame in cut(settings, quiet):

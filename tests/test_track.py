@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locagen_edge.geometry import angles, direction, quaternion, rotation, wrap
-from locagen_edge.settings import TrackSettings
+from locagen_edge.geometry import angles, direction, quaternion, rotation, to_earth, wrap
+from locagen_edge.settings import PoseSettings, TrackSettings
 from locagen_edge.stages.track import Tracker
 from locagen_edge.stages.track.tracker import SWELL_S
 from locagen_edge.types import Bearing, Detection, Quaternion, Track
@@ -33,8 +33,15 @@ def heard(azimuth_deg: float | None, sigma_deg: float = 2.0, elevation_deg: floa
     )
 
 
-def tracker(tolerance_deg: float = 0.0, **changed) -> Tracker:
-    return Tracker(TrackSettings(**changed), math.radians(tolerance_deg), overlap=1.0)
+def tracker(
+    tolerance_deg: float = 0.0,
+    compass_deg: float = 3.0,
+    tilt_deg: float = 1.0,
+    normal: np.ndarray | None = None,
+    **changed,
+) -> Tracker:
+    pose = PoseSettings(compass_deg=compass_deg, tilt_deg=tilt_deg)
+    return Tracker(TrackSettings(**changed), pose, math.radians(tolerance_deg), 1.0, normal)
 
 
 def run(t: Tracker, bearings: list[Bearing], detection: Detection = CALL) -> list[Track | None]:
@@ -311,6 +318,24 @@ def test_what_the_body_sees_turns_with_it_and_is_surer_than_the_compass():
     assert track.earth.elevation_sigma_rad > math.radians(1.0)
 
 
+def test_a_look_is_the_frames_own_bearing_in_the_earths_axes():
+    """Not smoothed, and with its noise alone: no compass, no tolerance."""
+    t, rng = tracker(tolerance_deg=0.5), np.random.default_rng(13)
+    for frame in range(30):
+        attitude = turning(frame, 0.0)
+        bearing = seen(200.0, -30.0, attitude, rng)
+        track, *_ = t((bearing,), CALL, HOP_S, attitude)
+        wanted = to_earth(attitude, bearing.azimuth_rad, bearing.elevation_rad)
+        assert (track.look.azimuth_rad, track.look.elevation_rad) == pytest.approx(wanted)
+    sigmas = math.degrees(track.look.azimuth_sigma_rad), math.degrees(track.look.elevation_sigma_rad)
+    noise = math.sqrt(2.0**2 - 0.5**2)
+    leaning = math.hypot(noise, 0.02 * 40.0)  # what the lean, 40 degrees/s at most, moves it
+    assert noise / math.cos(math.radians(30)) - 0.1 < sigmas[0] < leaning / math.cos(math.radians(30)) + 0.1
+    assert noise - 0.01 < sigmas[1] < leaning + 0.01
+    assert t((), QUIET, HOP_S, attitude)[0].look is None
+    assert t((bearing,), CALL, HOP_S, None)[0].look is None
+
+
 def test_a_turn_in_the_silence_is_followed_by_what_the_body_sees():
     """The caller is silent while the drone turns by 90 degrees, and is found again where it was."""
     t = tracker(coast_s=5.0)
@@ -399,7 +424,7 @@ def test_a_caller_near_the_horizon_stays_where_it_is_when_a_drone_with_a_flat_ar
     own horizon, and the array puts it 40 degrees below the true one. Who does not know that loses it."""
     rng, ids, offs = np.random.default_rng(11), set(), []
     normal = np.array([0.0, 0.0, 1.0]) if mirrors else None
-    t = Tracker(TrackSettings(), 0.0, 1.0, normal)
+    t = tracker(normal=normal)
     for frame in range(150):
         attitude = quaternion(0.0, math.radians(-15.0 + 15.0 * math.cos(frame * HOP_S)), 0.0)
         tracks = t((lower(seen(5.0, -10.0, attitude, rng)),), CALL, HOP_S, attitude)

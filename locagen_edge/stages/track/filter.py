@@ -159,6 +159,7 @@ def predicted(state: State, motion: Motion, dt: float) -> State:
 class Innovation:
     """A measurement against a state, along the rows of `basis`, tangents to the sphere."""
 
+    measurement: Measurement
     basis: F64
     """(n, 3), n = 1 or 2"""
     off: F64
@@ -196,7 +197,7 @@ def innovation(state: State, m: Measurement) -> Innovation:
             basis, off, noise = basis[:1], off[:1], noise[:1, :1]
     basis = basis @ m.turn.T
     gate = basis @ state.p[:3, :3] @ basis.T + noise + m.fixed_variance * np.eye(len(off))
-    return Innovation(basis, off, noise, gate)
+    return Innovation(m, basis, off, noise, gate)
 
 
 def updated(state: State, i: Innovation, motion: Motion) -> State:

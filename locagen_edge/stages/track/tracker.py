@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from locagen_edge.geometry import angles, direction, rotation
-from locagen_edge.settings import TrackSettings
+from locagen_edge.settings import PoseSettings, TrackSettings
 from locagen_edge.stages.track import filter as sphere
 from locagen_edge.stages.track.association import associate
 from locagen_edge.types import F64, Bearing, Detection, Quaternion, Track, TrueBearing
@@ -61,6 +61,7 @@ class _Caller:
     chances: int = 1
     """frames with a bearing since birth, and in how many of them it was this track's"""
     confirmed: bool = False
+    look: TrueBearing | None = None
 
     @property
     def given_up(self) -> bool:
@@ -81,8 +82,14 @@ class Tracker:
     """
 
     def __init__(
-        self, settings: TrackSettings, tolerance_rad: float, overlap: float, normal: F64 | None = None
+        self,
+        settings: TrackSettings,
+        pose: PoseSettings,
+        tolerance_rad: float,
+        overlap: float,
+        normal: F64 | None = None,
     ):
+        self._compass, self._tilt = math.radians(pose.compass_deg), math.radians(pose.tilt_deg)
         self._normal = normal
         self._settings = settings
         self._fixed = tolerance_rad**2
@@ -125,6 +132,7 @@ class Tracker:
             caller.state = sphere.predicted(caller.state, self._motion, dt)
             caller.age_s += dt
             caller.silent_s += dt
+            caller.look = None
             caller.confidence *= math.exp(-dt / CONFIDENCE_S)
         self._callers = [c for c in self._callers if c.silent_s <= self._settings.coast_s]
         self._turn = turn
@@ -160,6 +168,7 @@ class Tracker:
                 caller = self._callers[place]
                 caller.state = sphere.updated(caller.state, innovations[number][place], self._motion)
                 caller.elevation_known |= measurements[number].elevation is not None
+                caller.look = self._look(innovations[number][place].measurement)
                 caller.silent_s = 0.0
                 caller.heard += 1
                 caller.confirmed |= caller.heard >= CONFIRM_HEARD
@@ -171,7 +180,8 @@ class Tracker:
             if all(math.isinf(cost) for cost in row) and self._make_room():
                 state = sphere.born(m, self._motion)
                 known = m.elevation is not None
-                self._callers.append(_Caller(next(self._ids), state, known, confidence=agreed))
+                caller = _Caller(next(self._ids), state, known, confidence=agreed, look=self._look(m))
+                self._callers.append(caller)
 
     def _nearest(self, state: sphere.State, m: sphere.Measurement) -> sphere.Innovation:
         """Against whichever answer is nearer, of those that are below the true horizon."""
@@ -234,17 +244,31 @@ class Tracker:
             id=caller.id,
             confirmed=caller.confirmed,
             earth=None if self._turn is None else self._in_earth(caller),
+            look=caller.look,
         )
 
     def _in_earth(self, caller: _Caller) -> TrueBearing:
-        compass, tilt = math.radians(self._settings.compass_deg), math.radians(self._settings.tilt_deg)
         _, slope = angles(caller.state.u)
         # leaning by a wrong angle moves what is below sideways, and what is level up and down
         azimuth, azimuth_sigma, elevation, elevation_sigma = self._seen(
-            caller, np.eye(3), level=(tilt * math.sin(slope)) ** 2, up=tilt**2
+            caller, np.eye(3), level=(self._tilt * math.sin(slope)) ** 2, up=self._tilt**2
         )
-        azimuth_sigma = min(math.hypot(azimuth_sigma, compass), NOWHERE_RAD)
+        azimuth_sigma = min(math.hypot(azimuth_sigma, self._compass), NOWHERE_RAD)
         return TrueBearing(azimuth, azimuth_sigma, elevation, elevation_sigma)
+
+    def _look(self, m: sphere.Measurement) -> TrueBearing | None:
+        """One frame's bearing in the earth's axes, with the sigmas of its noise."""
+        if self._turn is None:
+            return None
+        here = direction(m.azimuth, m.elevation or 0.0)
+        there = self._turn @ here
+        azimuth, elevation = angles(there)
+        rows = sphere.tangent(there) @ self._turn @ sphere.tangent(here).T
+        level, up = np.diag(rows @ np.diag([m.level_variance, m.up_variance]) @ rows.T)
+        azimuth_sigma = min(math.sqrt(level) / max(math.cos(elevation), 1e-9), NOWHERE_RAD)
+        known = m.elevation is not None
+        elevation_sigma = min(math.sqrt(up), NOWHERE_RAD) if known else NOWHERE_RAD
+        return TrueBearing(azimuth, azimuth_sigma, elevation if known else None, elevation_sigma)
 
     def _seen(
         self, caller: _Caller, turn: F64, level: float = 0.0, up: float = 0.0
