@@ -152,8 +152,8 @@ class Track:
     earth: TrueBearing | None = None
     """None: the attitude is not known now, and the track is followed in body axes"""
     look: TrueBearing | None = None
-    """this frame's own bearing of the caller, not smoothed, with the sigmas of its noise alone: what positions
-    are made of. None: not heard in this frame, or the attitude is not known"""
+    """this frame's own bearing of the caller, not smoothed, with the sigmas of its noise alone: what
+    positions are made of. None: not heard in this frame, or the attitude is not known"""
 
 
 @dataclass(frozen=True, slots=True)

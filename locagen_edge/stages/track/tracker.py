@@ -59,7 +59,7 @@ class _Caller:
     confidence: float = 0.0
     heard: int = 1
     chances: int = 1
-    """frames with a bearing since birth, and in how many of them it was this track's"""
+    """frames with a bearing since birth; in `heard` of them it was this track's"""
     confirmed: bool = False
     look: TrueBearing | None = None
 
