@@ -32,7 +32,7 @@ class Pipeline:
         self._pick = PeakPicker(*shape)
         self._locate = make_locator(settings)
         self._detect = Detector(settings.detection)
-        self._find_faults = FaultFinder()
+        self._find_faults = FaultFinder(settings)
         self._track = Tracker(
             settings.track,
             settings.pose,
@@ -53,19 +53,19 @@ class Pipeline:
         self._last_ns = frame.t_ns
         correlation = self._correlate(frame)
         tdoa = self._pick(correlation)
-        bearing = self._locate(frame, tdoa)
-        detection = self._detect(correlation, bearing, elapsed_s)
+        bearings = self._locate(frame, tdoa, elapsed_s)
+        detection = self._detect(correlation, bearings[0], elapsed_s)
         self._locate.settle(detection.call)
-        tracks = self._track((bearing,), detection, elapsed_s, pose.attitude if pose else None)
+        tracks = self._track(bearings, detection, elapsed_s, pose.attitude if pose else None)
         return Estimate(
             t_ns=frame.t_ns,
             start=frame.start,
             overruns=frame.overruns,
             tdoa=tdoa,
-            bearing=bearing,
+            bearing=bearings[0],
             detection=detection,
             track=tracks[0] if tracks else None,
-            faults=self._find_faults(frame, correlation, tdoa, bearing, elapsed_s),
+            faults=self._find_faults(frame, correlation, tdoa, elapsed_s),
             truth=frame.truth,
             tracks=tracks,
             pose=pose,
