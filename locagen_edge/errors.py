@@ -35,3 +35,7 @@ class KernelError(LocagenError):
 
 class DatasetError(LocagenError):
     """A data set that cannot be written, is not complete, or is not what the settings ask for."""
+
+
+class StorageError(LocagenError):
+    """A folder or disk that cannot be written to, or has no room left."""

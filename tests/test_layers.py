@@ -49,7 +49,7 @@ def test_what_is_not_used_is_not_loaded():
     assert not loaded & {"onnxruntime", "sounddevice", "soundfile", "tqdm"}
 
 
-GROUND = {"types", "geometry", "errors", "settings", "kernel", "models", "framing", "resampling"}
+GROUND = {"types", "geometry", "errors", "settings", "kernel", "models", "framing", "resampling", "jsonl"}
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
     "stages": GROUND,
@@ -57,9 +57,10 @@ ABOVE = {
     "mavlink": GROUND,
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
+    "store": GROUND,
     "notify": set(),
     "check": GROUND | {"stages", "mavlink", "pipeline", "sources"},
-    "daemon": GROUND | {"stages", "mavlink", "pipeline", "sources", "notify"},
+    "daemon": GROUND | {"stages", "mavlink", "pipeline", "sources", "notify", "store"},
 }
 """What each part may import. The command line and the workshop stand on top and may import anything."""
 
