@@ -382,7 +382,7 @@ class LogSettings:
         "nowhere when `run` is started by hand.",
     )
     total_mb: float = setting(
-        200.0, "All of the log; the oldest part is deleted for a new one. A call fills about 20 MB an hour.",
+        200.0, "All of the log; the oldest part is deleted for a new one. An hour of calls fills 50 MB.",
         unit="MB", least=0.01, most=1e6,
     )  # fmt: skip
     part_mb: float = setting(10.0, "One part.", unit="MB", least=0.001, most=1000)

@@ -25,6 +25,8 @@ def prepare(directory: Path) -> None:
         probe = directory / f".{os.getpid()}{PART}"
         probe.touch()
         probe.unlink()
+    except FileExistsError as error:
+        raise StorageError(f"{directory}: is a file, not a folder") from error
     except OSError as error:
         raise StorageError(f"{directory}: cannot be written to: {error.strerror}") from error
 

@@ -19,7 +19,7 @@ def row(record: Record) -> str:
     except (KeyError, TypeError, ValueError, AttributeError):
         text = json.dumps({k: v for k, v in record.items() if k not in ("type", "utc", "t_ns")})
     utc = str(record.get("utc", "")).removesuffix("+00:00").replace("T", " ")
-    return f"{utc:23}  {kind:8}  {text}"
+    return f"{utc:23}  {kind:8}  {text}".replace("\n", " ")
 
 
 def chosen(records: Iterable[Record], kinds: set[str], since: datetime | None) -> Iterator[Record]:
