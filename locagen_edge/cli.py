@@ -18,7 +18,7 @@ import signal
 import statistics
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -27,7 +27,7 @@ from locagen_edge import __version__
 from locagen_edge.errors import LocagenError, SettingsError, SourceError, SourceHungError, StorageError
 from locagen_edge.geometry import compass_deg
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
-from locagen_edge.types import Estimate
+from locagen_edge.types import Estimate, Frame
 
 if TYPE_CHECKING:
     from locagen_edge.daemon import Daemon
@@ -114,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--seconds", type=_positive, metavar="N", help="stop after N seconds")
     run.add_argument("--quiet", action="store_true", help="no line per second (under a service manager)")
+    run.add_argument("--record", type=Path, metavar="DIR", help="keep the sound too, as `record` does")
 
     replay = command(
         "replay",
@@ -226,15 +227,41 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 def _run(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
-    asyncio.run(_serve(settings, arguments.seconds, quiet=arguments.quiet))
+    recorder = None
+    if arguments.record is not None:
+        from locagen_edge.store.recorder import Recorder
+
+        recorder = Recorder(arguments.record, settings)
+    try:
+        asyncio.run(_serve(settings, arguments.seconds, recorder, quiet=arguments.quiet))
+    finally:
+        if recorder is not None:
+            recorder.close()
     return 0
 
 
-async def _serve(settings: Settings, seconds: float | None, *, quiet: bool) -> None:
+async def _serve(
+    settings: Settings, seconds: float | None, recorder: Recorder | None, *, quiet: bool
+) -> None:
     from locagen_edge.daemon import Daemon
+    from locagen_edge.sources import open_source
 
     live = LiveLine()
-    daemon = Daemon(settings, on_second=None if quiet else live)
+    told: list[str] = []
+
+    def each_second(daemon: Daemon) -> None:
+        if not quiet:
+            live(daemon)
+        if recorder is not None and recorder.failure and not told:
+            told.append(recorder.failure)
+            logging.error("%s; bearings go on", recorder.failure)
+
+    def source(settings: Settings) -> AsyncGenerator[Frame, None]:
+        if recorder is not None:
+            recorder.gap(0)  # each time it is opened it begins anew
+        return open_source(settings, recorder)
+
+    daemon = Daemon(settings, on_second=each_second, sources=source)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, daemon.stop)

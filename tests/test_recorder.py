@@ -90,6 +90,7 @@ def test_a_cards_recording_gives_its_frames_again_with_their_times_and_losses(tm
         audio={"source": "alsa", "device_channels": 4, "channel_map": [3, 0, 1]},
     )
     recorder = Recorder(tmp_path, settings)
+    recorder.gap(0)  # as `run --record` begins
     card = Card()
     live = list(capture(card, settings, card.wait, card.now_ns, recorder))
     recorder.close()
@@ -377,79 +378,6 @@ def test_rows_as_captured_are_chosen_by_the_map_again():
     rows = as_captured(samples, (4, 0, 2))
     assert rows.shape == (4, 5)
     np.testing.assert_array_equal(rows[:, [4, 0, 2]].T, samples)
-
-
-# --- as the user meets it
-
-
-def test_record_then_replay_of_the_folder(tmp_path, settings_file):
-    folder = tmp_path / "parts"
-    process = start(folder, "--settings", str(settings_file), "--seconds", "1.5")
-    out, err = process.communicate(timeout=30)
-    assert process.returncode == 0, err
-    assert f"1.5 s in {folder}, 0 overruns, 0 blocks lost" in out.replace("1.6 s", "1.5 s")
-    assert err == ""  # no progress line where nobody watches
-    replay = subprocess.run(
-        [sys.executable, "-m", "locagen_edge", "replay", str(folder)],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        check=True,
-    )
-    assert f"settings: {sounds(folder)[0].with_suffix('.toml')}" in replay.stderr
-    assert len(replay.stdout.splitlines()) in (28, 29)
-
-
-def test_a_signal_ends_a_recording_whole(tmp_path, settings_file):
-    process = start(tmp_path / "parts", "--settings", str(settings_file))
-    while process.poll() is None and not list((tmp_path / "parts").glob("*.wav")):
-        os.sched_yield()
-    process.send_signal(signal.SIGTERM)
-    out, err = process.communicate(timeout=30)
-    assert process.returncode == 0, err
-    assert "replay" in out
-    assert not list((tmp_path / "parts").glob("*.part"))
-
-
-def test_a_disk_that_fills_up_ends_the_recording_whole_and_says_so(tmp_path, settings_file):
-    """A limit on the size of files stands for the disk: both come in the middle of a write."""
-    settings_file.write_text("[record]\nfree_mb = 0\n")
-    folder = tmp_path / "parts"
-    command = f"ulimit -f 120; exec {sys.executable} -m locagen_edge record"
-    done = subprocess.run(
-        ["bash", "-c", f"{command} --seconds 20 --output {folder} --settings {settings_file}"],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        check=False,
-    )
-    assert done.returncode == 1
-    assert f"locagen-edge: {folder}: File too large: the recording ends here" in done.stderr
-    assert "Traceback" not in done.stderr
-    (sound,) = sounds(folder)
-    assert soundfile.info(sound).frames == (120 * 1024 - HEADER.size) // 12
-    assert not list(folder.glob("*.part"))
-
-
-@pytest.mark.parametrize("where", ["under a file", "no such disk"])
-def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path, where):
-    (tmp_path / "file").touch()
-    folder = {"under a file": tmp_path / "file" / "parts", "no such disk": Path("/proc/parts")}[where]
-    process = start(folder, "--seconds", "1")
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 1
-    assert err.startswith(f"locagen-edge: {folder}: cannot be written to: ")
-    assert len(err.splitlines()) == 1
-
-
-def test_a_source_that_is_not_there_is_one_line(tmp_path, settings_file):
-    settings_file.write_text('[audio]\nsource = "wav"\nfile = "gone.wav"\n[record]\nfree_mb = 0\n')
-    process = start(tmp_path / "parts", "--settings", str(settings_file))
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 1
-    assert err == "locagen-edge: gone.wav: there is no such file\n"
-    assert list((tmp_path / "parts").iterdir()) == []
 
 
 def test_a_line_is_one_line():
