@@ -162,6 +162,29 @@ def test_an_azimuth_is_kept_from_0_to_360_and_what_is_no_number_as_null(azimuth,
     assert (found["azimuth_sigma_deg"] is None) == math.isinf(math.degrees(sigma))
 
 
+def test_several_callers_are_told_apart_by_their_ids(tmp_path):
+    @dataclasses.dataclass(frozen=True)
+    class Identified(Track):
+        id: int = 0
+
+    @dataclasses.dataclass(frozen=True)
+    class Several(Estimate):
+        tracks: tuple[Track, ...] = ()
+
+    def values(of_what) -> dict:
+        return {f.name: getattr(of_what, f.name) for f in dataclasses.fields(of_what)}
+
+    def heard(number: int, *ids: int) -> Estimate:
+        tracks = tuple(Identified(**{**values(TRACK), "id": each}) for each in ids)
+        return Several(**{**values(estimate(number)), "tracks": tracks})
+
+    both = [heard(n, 5, 9) for n in range(10)]
+    one = [heard(n, 9) for n in range(10, 20)]
+    found = kept(tmp_path, both + one)
+    assert [r["track"]["id"] for r in of(found, "call", "begin")] == [5, 9]
+    assert [(r["track"]["id"], r["t_ns"] // HOP_NS) for r in of(found, "call", "end")] == [(5, 9), (9, 19)]
+
+
 def test_every_bearing_while_something_calls_and_one_a_second_else(tmp_path):
     quiet = [estimate(n) for n in range(100)]
     calling = [estimate(n, call=True) for n in range(100, 150)]

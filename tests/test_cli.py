@@ -60,7 +60,7 @@ def recording(tmp_path_factory) -> Path:
 # --- help and usage
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["replay"], ["devices"], ["check"]])
+@pytest.mark.parametrize("command", [[], ["run"], ["replay"], ["record"], ["log"], ["devices"], ["check"]])
 def test_help_is_there(command):
     done = cli(*command, "--help")
     assert done.returncode == 0
@@ -77,6 +77,7 @@ def test_help_is_there(command):
         ["run", "--seconds", "0"],
         ["run", "--seconds", "x"],
         ["replay", "a", "--format", "xml"],
+        ["record", "--seconds", "-1"],
     ],
 )
 def test_wrong_usage_is_exit_code_2(arguments):

@@ -33,6 +33,7 @@ def modules_after(statement: str) -> set[str]:
         "import locagen_edge.cli",
         "import locagen_edge.check",
         "import locagen_edge.stages.mic",
+        "import locagen_edge.store.recorder",
         "from locagen_edge.pipeline import Pipeline; from locagen_edge.settings import from_table; "
         "Pipeline(from_table({'bearing': {'estimator': 'model:tdoa-mlp'}}))",
     ],

@@ -247,8 +247,9 @@ class BlackBox:
 
 
 def _tracks(estimate: Estimate) -> dict[Any, Track]:
-    """Tracks by what tells them apart."""
-    return {} if estimate.track is None else {0: estimate.track}
+    """Tracks by what tells them apart: an id, or that there is but one."""
+    alone = () if estimate.track is None else (estimate.track,)
+    return {getattr(track, "id", 0): track for track in getattr(estimate, "tracks", alone)}
 
 
 def _call_record(heard: _Heard, event: str, number: int, track: Track) -> Record:

@@ -28,7 +28,7 @@ from typing import BinaryIO
 from locagen_edge.errors import StorageError
 from locagen_edge.jsonl import encode
 from locagen_edge.settings import Settings, sample
-from locagen_edge.store.folder import PART, finish, groups, make_room
+from locagen_edge.store.folder import PART, finish, groups, make_room, sync
 from locagen_edge.store.wav import LONGEST, WavWriter, mend
 from locagen_edge.types import Array
 
@@ -40,6 +40,8 @@ BLOCKS = ".blocks.jsonl"
 
 @dataclass(frozen=True, eq=False)
 class Block:
+    """Rows as a source delivered them (`framing.Tap`)."""
+
     rows: Array
     rate_hz: float
     origin_ns: int
@@ -127,10 +129,14 @@ class Part:
         self._lines: BinaryIO = self._paths[1].open("xb")
         try:
             _lock(self._lines)
-            self._beside = self._paths[2].write_bytes(self._settings_text(settings))
+            with self._paths[2].open("wb") as file:
+                self._beside = file.write(self._settings_text(settings))
+                file.flush()
+                os.fsync(file.fileno())
             sample_type = str(first.rows.dtype)
             self._sound = WavWriter(self._paths[0], round(first.rate_hz), first.rows.shape[1], sample_type)
             self.line(self._first_record())
+            sync(directory)
         except OSError:
             with suppress(OSError):
                 self._lines.close()
@@ -221,9 +227,12 @@ def recover(directory: Path) -> list[Path]:
 
 def _is_being_written(paths: list[Path]) -> bool:
     for path in paths:
-        with path.open("rb") as file:
-            if not _lock(file):
-                return True
+        try:
+            with path.open("rb") as file:
+                if not _lock(file):
+                    return True
+        except FileNotFoundError:  # it was just finished
+            return True
     return False
 
 
