@@ -249,7 +249,7 @@ class BlackBox:
 def _tracks(estimate: Estimate) -> dict[Any, Track]:
     """Tracks by what tells them apart: an id, or that there is but one."""
     alone = () if estimate.track is None else (estimate.track,)
-    return {getattr(track, "id", 0): track for track in getattr(estimate, "tracks", alone)}
+    return {getattr(track, "id", 0): track for track in getattr(estimate, "tracks", ()) or alone}
 
 
 def _call_record(heard: _Heard, event: str, number: int, track: Track) -> Record:

@@ -136,6 +136,7 @@ class Part:
             sample_type = str(first.rows.dtype)
             self._sound = WavWriter(self._paths[0], round(first.rate_hz), first.rows.shape[1], sample_type)
             self.line(self._first_record())
+            self.sync()  # a part without its record would seem to be of another session
             sync(directory)
         except OSError:
             with suppress(OSError):
