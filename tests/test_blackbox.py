@@ -381,8 +381,8 @@ def test_no_bearing_is_lost_while_the_link_is_down(tmp_path):
         async with running(settings, sources=source(settings)) as daemon:
             process = daemon.pipeline.process
 
-            def listening(each: Frame) -> Estimate:
-                spoken.append(process(each))
+            def listening(*arguments) -> Estimate:
+                spoken.append(process(*arguments))
                 return spoken[-1]
 
             daemon.pipeline.process = listening
