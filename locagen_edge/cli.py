@@ -7,28 +7,42 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import io
 import json
 import logging
 import math
 import os
+import shutil
 import signal
 import statistics
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from locagen_edge import __version__
-from locagen_edge.errors import CalibrationError, LocagenError, SourceHungError
+from locagen_edge.errors import (
+    CalibrationError,
+    LocagenError,
+    SourceError,
+    SourceHungError,
+    StorageError,
+)
 from locagen_edge.geometry import compass_deg
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
-from locagen_edge.types import Estimate
+from locagen_edge.types import Estimate, Frame
 
 if TYPE_CHECKING:
     from locagen_edge.daemon import Daemon
+    from locagen_edge.jsonl import Record
     from locagen_edge.mavlink.link import Link
+    from locagen_edge.store.recorder import Progress, Recorder
+
+SERVICE_STATE = Path("/var/lib/locagen-edge")
+TYPES = ("start", "stop", "bearing", "call", "fault", "link", "source", "losses", "lost")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -103,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--seconds", type=_positive, metavar="N", help="stop after N seconds")
     run.add_argument("--quiet", action="store_true", help="no line per second (under a service manager)")
+    run.add_argument("--record", type=Path, metavar="DIR", help="keep the sound too, as `record` does")
 
     replay = command(
         "replay",
@@ -113,9 +128,51 @@ def _parser() -> argparse.ArgumentParser:
         "null means that nothing can be said. The estimate is given whether or not `call` is true. A call "
         "stands out of the background: a sound that is there from the first frame to the last is none.",
     )
-    replay.add_argument("file", type=Path, metavar="FILE.wav", help="WAV or FLAC, any rate and channel count")
+    replay.add_argument(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="FILE.wav",
+        help="WAV or FLAC, any rate and channel count; several, or a folder of them, are one after another",
+    )
     replay.add_argument(
         "--format", choices=("jsonl", "table"), default="jsonl", help="JSON lines (default) or a table"
+    )
+
+    record = command(
+        "record",
+        _record,
+        "keep all channels of the source on disk, in parts, as they come",
+        "Parts are WAV with the device's rate and channels; beside each are its settings and how the sound "
+        "came, so that `replay DIR` gives the bearings of the day. What a loss of power leaves behind is "
+        "mended by the next start in the same folder. Bounds are in the settings under [record]. SIGINT or "
+        "SIGTERM ends it.",
+    )
+    record.add_argument(
+        "--output", type=Path, metavar="DIR", help="where the parts go (default: record.directory)"
+    )
+    record.add_argument("--seconds", type=_positive, metavar="N", help="stop after N seconds of sound")
+
+    log = command(
+        "log",
+        _log,
+        "print the black box of `run`: calls, faults, links, losses, and on request every bearing",
+        "A record that a loss of power has torn is passed over.",
+    )
+    log.add_argument(
+        "directory",
+        type=Path,
+        nargs="?",
+        metavar="DIR",
+        help=f"where it is (default: log.directory, else {SERVICE_STATE})",
+    )
+    log.add_argument(
+        "--type", action="append", default=[], choices=TYPES, help="only these; more than once for several"
+    )
+    log.add_argument("--since", type=_moment, metavar="TIME", help="not older: ISO 8601, in UTC")
+    log.add_argument("--last", type=_count, metavar="N", help="the last N lines")
+    log.add_argument(
+        "--format", choices=("table", "jsonl"), default="table", help="a table (default) or the records"
     )
 
     command(
@@ -195,6 +252,20 @@ def _positive(text: str) -> float:
     return value
 
 
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
+    return int(text)
+
+
+def _moment(text: str) -> datetime:
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time like 2026-07-01T12:00") from None
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+
+
 def _settings(arguments: argparse.Namespace) -> Settings:
     if arguments.settings is not None:
         return load(arguments.settings)
@@ -206,15 +277,41 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 def _run(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
-    asyncio.run(_serve(settings, arguments.seconds, quiet=arguments.quiet))
+    recorder = None
+    if arguments.record is not None:
+        from locagen_edge.store.recorder import Recorder
+
+        recorder = Recorder(arguments.record, settings)
+    try:
+        asyncio.run(_serve(settings, arguments.seconds, recorder, quiet=arguments.quiet))
+    finally:
+        if recorder is not None:
+            recorder.close()
     return 0
 
 
-async def _serve(settings: Settings, seconds: float | None, *, quiet: bool) -> None:
+async def _serve(
+    settings: Settings, seconds: float | None, recorder: Recorder | None, *, quiet: bool
+) -> None:
     from locagen_edge.daemon import Daemon
+    from locagen_edge.sources import open_source
 
     live = LiveLine()
-    daemon = Daemon(settings, on_second=None if quiet else live)
+    told: list[str] = []
+
+    def each_second(daemon: Daemon) -> None:
+        if not quiet:
+            live(daemon)
+        if recorder is not None and recorder.failure and not told:
+            told.append(recorder.failure)
+            logging.error("%s; bearings go on", recorder.failure)
+
+    def source(settings: Settings) -> AsyncGenerator[Frame, None]:
+        if recorder is not None:
+            recorder.gap(0)  # each time it is opened it begins anew
+        return open_source(settings, recorder)
+
+    daemon = Daemon(settings, on_second=each_second, sources=source)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, daemon.stop)
@@ -345,18 +442,36 @@ def record(estimate: Estimate, t_s: float) -> dict[str, Any]:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
+    files = _recordings(arguments.files)
+    beside = files[0].with_suffix(".toml")
+    if arguments.settings is None and beside.is_file():
+        logging.info("settings: %s", beside)
+        arguments.settings = beside
     settings = _settings(arguments)
     if arguments.format == "table":
         print("  ".join(f"{name:>{_width(name)}}" for name in COLUMNS))
-    for line in replay(arguments.file, settings):
+    for line in replay(files, settings):
         print(json.dumps(line) if arguments.format == "jsonl" else _row(line))
     sys.stdout.flush()
     return 0
 
 
-def replay(path: Path, settings: Settings) -> Iterator[dict[str, Any]]:
-    """The records of a recording, hop by hop, with a progress bar where the error stream is a terminal
-    and the records go elsewhere."""
+def _recordings(paths: list[Path]) -> list[Path]:
+    """Files as given, folders as the recordings in them, by name: the order in which `record` made them."""
+    found: list[Path] = []
+    for path in paths:
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in (".wav", ".flac"))
+        if not inside:
+            raise SourceError(f"{path}: there is no WAV or FLAC in this folder")
+        found += inside
+    return found
+
+
+def replay(files: list[Path], settings: Settings) -> Iterator[dict[str, Any]]:
+    """The records of recordings as if they were one, hop by hop, with a progress bar where the error stream
+    is a terminal and the records go elsewhere."""
     from tqdm import tqdm
 
     from locagen_edge.pipeline import Pipeline
@@ -365,14 +480,14 @@ def replay(path: Path, settings: Settings) -> Iterator[dict[str, Any]]:
     pipeline = Pipeline(settings)
     rate_hz, frame_s = settings.audio.rate_hz, settings.audio.frame / settings.audio.rate_hz
     bar = tqdm(
-        total=round(wav_duration_s(path, settings), 1),
+        total=round(wav_duration_s(files, settings), 1),
         unit="s",
-        desc=path.name,
+        desc=files[0].name if len(files) == 1 else f"{len(files)} files",
         disable=not sys.stderr.isatty() or sys.stdout.isatty(),
         bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s of sound, {elapsed} so far",
     )
     with bar:
-        for frame in wav_frames(path, settings):
+        for frame in wav_frames(files, settings):
             t_s = frame.start / rate_hz
             bar.update(t_s + frame_s - bar.n)
             yield record(pipeline.process(frame), t_s)
@@ -393,6 +508,105 @@ def _row(line: dict[str, Any]) -> str:
             text = "; ".join(value) if isinstance(value, list) else "-" if value is None else str(value)
             cells.append(f"{text:>{_width(name)}}")
     return "  ".join(cells)
+
+
+# --- record -------------------------------------------------------------------------------------------
+
+
+def _record(arguments: argparse.Namespace) -> int:
+    from locagen_edge.store.recorder import Recorder
+
+    settings = _settings(arguments)
+    directory = arguments.output or Path(settings.record.directory)
+    recorder = Recorder(directory, settings)
+    try:
+        overruns = asyncio.run(_keep(settings, recorder, arguments.seconds))
+    finally:
+        if sys.stderr.isatty():
+            print(file=sys.stderr)
+        recorder.close()
+    if recorder.failure:
+        raise StorageError(recorder.failure)
+    done = recorder.progress()
+    print(
+        f"{done.seconds:.1f} s in {directory}, {overruns} overruns, {done.lost} blocks lost; "
+        f"hear it with: locagen-edge replay {directory}"
+    )
+    return 0
+
+
+async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -> int:
+    """Reads the source, which fills the recorder, until the time is over or a signal comes. Overruns."""
+    from locagen_edge.sources import open_source
+
+    stopping = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stopping.set)
+    stop = asyncio.create_task(stopping.wait())
+    overruns, second = 0, 0
+    async with contextlib.aclosing(open_source(settings, recorder)) as source:
+        while not recorder.failure:
+            coming = asyncio.ensure_future(anext(source, None))
+            await asyncio.wait([coming, stop], return_when=asyncio.FIRST_COMPLETED)
+            if stop.done():
+                coming.cancel()
+                await asyncio.gather(coming, return_exceptions=True)
+                break
+            frame = coming.result()
+            if frame is None:  # a recording's end
+                break
+            overruns += frame.overruns
+            heard_s = (frame.start + frame.samples.shape[1]) / frame.rate_hz
+            if seconds is not None and heard_s >= seconds:
+                break
+            if int(heard_s) > second:
+                second = int(heard_s)
+                _show(recorder.progress(), overruns)
+    stop.cancel()
+    return overruns
+
+
+def _show(progress: Progress, overruns: int) -> None:
+    """One line that is written over, on a terminal: what there is, and the level of each channel."""
+    if not sys.stderr.isatty():
+        return
+    levels = " ".join(f"{_dbfs(rms):4.0f}" for rms in progress.rms)
+    peak = _dbfs(max(progress.peak, default=0.0))
+    text = (
+        f"{progress.seconds:7.0f} s  {progress.name}  {progress.kept_bytes / 1e6:.1f} MB  "
+        f"rms {levels} dBFS, peak {peak:.0f}  {overruns} overruns, {progress.lost} lost"
+    )
+    print(f"\r{text[: shutil.get_terminal_size().columns - 1]}\033[K", end="", file=sys.stderr, flush=True)
+
+
+def _dbfs(amplitude: float) -> float:
+    return 20.0 * math.log10(max(amplitude, 1e-6))
+
+
+# --- log ----------------------------------------------------------------------------------------------
+
+
+def _log(arguments: argparse.Namespace) -> int:
+    from locagen_edge.store.blackbox import directory_of
+    from locagen_edge.store.journal import records
+    from locagen_edge.store.logbook import HEADER, chosen, row
+
+    directory = arguments.directory or directory_of(_settings(arguments)) or SERVICE_STATE
+    try:
+        found: Iterable[Record] = chosen(records(directory), set(arguments.type), arguments.since)
+        if arguments.last is not None:
+            found = deque(found, arguments.last)
+        if arguments.format == "table":
+            print(HEADER)
+        for record in found:
+            print(row(record) if arguments.format == "table" else json.dumps(record))
+    except (FileNotFoundError, NotADirectoryError):
+        raise StorageError(f"{directory}: there is no such folder; is log.directory set?") from None
+    except PermissionError:
+        raise StorageError(f"{directory}: may not be read: as root, or the user locagen-edge") from None
+    sys.stdout.flush()
+    return 0
 
 
 # --- devices ------------------------------------------------------------------------------------------

@@ -23,12 +23,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from locagen_edge.errors import SourceError, SourceHungError
-from locagen_edge.mavlink.component import Component, Status
+from locagen_edge.mavlink.component import Component, Status, is_confirmed
 from locagen_edge.mavlink.link import Link, parse
 from locagen_edge.notify import notify
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings
 from locagen_edge.sources import open_source
+from locagen_edge.store.blackbox import BlackBox, directory_of
 from locagen_edge.types import Estimate, Frame
 
 log = logging.getLogger(__name__)
@@ -76,6 +77,7 @@ class Daemon:
         self.counters = Counters()
         self.estimate: Estimate | None = None
         self.source_fault = ""
+        self.black_box: BlackBox | None = None
         self._on_second = on_second
         self._sources = sources
         self._stopping = asyncio.Event()
@@ -105,6 +107,9 @@ class Daemon:
             asyncio.create_task(self._work(), name="work"),
             asyncio.create_task(self._tick(), name="tick"),
         ]
+        log_directory = directory_of(self.settings)
+        if log_directory is not None:
+            self.black_box = BlackBox(log_directory, self.settings, is_confirmed)
         notify(STATUS="waiting for the first sound")
 
     async def main_loop(self) -> None:
@@ -142,6 +147,9 @@ class Daemon:
             if task.done() and not task.cancelled() and (error := task.exception()) is not self._told:
                 log.error("while stopping, %s: %s", task.get_name(), error)
         self._executor.shutdown(wait=False, cancel_futures=True)
+        if self.black_box is not None:
+            # it has written all along: only a disk that hangs takes so long
+            self.black_box.close(max(start + STOP_S - time.monotonic(), 0.05))
         return not hanging and not self._working
 
     # --- source -> queue
@@ -192,6 +200,8 @@ class Daemon:
             pose = self.component.poses.at(frame.t_ns + frame_ns // 2)
             self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
             self._working = False
+            if self.black_box is not None:
+                self.black_box.hear(frame, self.estimate)
             self._heard_s = time.monotonic()
             self.counters.estimates += 1
             self.counters.latency_s.append((time.monotonic_ns() - frame.t_ns - frame_ns) * 1e-9)
@@ -247,10 +257,23 @@ class Daemon:
             else:
                 notify(STATUS=self._in_words())
             self.counters.latency_s.clear()
+            if self.black_box is not None:
+                self.black_box.watch(**self._states())
+
+    def _states(self) -> dict[str, dict[str, object]]:
+        """What the black box keeps the changes of."""
+        c = self.counters
+        return {
+            "link": {"up": self.link.up, "error": "" if self.link.up else self.link.last_error},
+            "source": {"fault": self.source_fault},
+            "losses": {"frames": c.dropped, "overruns": c.overruns, "messages": self.link.dropped},
+        }
 
     def _in_words(self) -> str:
         """The service manager's status line: state, and every loss since the start."""
         c = self.counters
         state = "listening" if self.hearing else f"no sound: {self.source_fault or 'waiting'}"
         losses = f"{c.dropped} dropped, {c.overruns} overruns, {self.link.dropped} messages lost"
+        if self.black_box is not None and self.black_box.lost:
+            losses += f", {self.black_box.lost} log records lost"
         return f"{state}; {c.estimates} frames, {losses}"

@@ -12,10 +12,32 @@ import time
 from collections.abc import AsyncGenerator, Generator
 from contextlib import closing
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
-from locagen_edge.types import F32, Frame
+from locagen_edge.types import F32, Array, Frame
+
+
+class Tap(Protocol):
+    """Hears all that a source delivers, before channels are chosen and rates changed.
+
+    The same blocks with the same origins, cut and resampled again, give the same frames, bit for bit. Both
+    are called in the thread that reads the source, and must not wait.
+    """
+
+    def block(self, rows: Array, rate_hz: float, origin_ns: int) -> None:
+        """Rows (n, channels), int16 or float32, its own to keep, and `Framer.origin_ns` as it is for them."""
+
+    def gap(self, overruns: int) -> None:
+        """Sound was lost before the next block; 0: none was, but the next begins anew."""
+
+
+def as_captured(samples: F32, channel_map: tuple[int, ...]) -> F32:
+    """(mics, n) as the rows (n, channels) that `audio.channel_map` would choose them from."""
+    rows = np.zeros((samples.shape[1], max(channel_map) + 1), dtype=np.float32)
+    rows[:, list(channel_map)] = samples.T
+    return rows
 
 
 class Framer:

@@ -410,6 +410,73 @@ class DaemonSettings:
 
 
 @dataclass(frozen=True)
+class RecordSettings:
+    """`locagen-edge record`: all channels of the source as they come, in parts, on disk."""
+
+    directory: str = setting("recordings", "Where the parts go; --output comes before it.")
+    part_s: float = setting(600.0, "Longest part.", unit="s", least=0.1, most=86400)
+    part_mb: float = setting(
+        1000.0, "Largest part; three channels of 16 bit at 48 kHz fill 17 MB a minute.",
+        unit="MB", least=0.01, most=4000,
+    )  # fmt: skip
+    total_mb: float = setting(
+        16000.0,
+        "All parts in the folder together, at least two of the largest; what other programs keep there does "
+        "not count.",
+        unit="MB",
+        least=0.1,
+        most=1e8,
+    )
+    free_mb: float = setting(
+        500.0, "What has to stay free on the disk, for whoever else writes there.",
+        unit="MB", least=0, most=1e8,
+    )  # fmt: skip
+    when_full: str = setting(
+        "stop",
+        "At either bound: `stop`, or give up the `oldest` parts of the folder for new ones.",
+        choices=("stop", "oldest"),
+    )
+    sync_s: float = setting(
+        2.0, "What a loss of power costs at most: so often all is forced to the disk.",
+        unit="s", least=0.1, most=60,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LogSettings:
+    """The black box of `locagen-edge run`: bearings and events, and on request the sound of each call."""
+
+    directory: str = setting(
+        "",
+        "Where it is kept; empty: the service's state directory, /var/lib/locagen-edge under systemd, and "
+        "nowhere when `run` is started by hand.",
+    )
+    total_mb: float = setting(
+        200.0, "All of the log; the oldest part is deleted for a new one. An hour of calls fills 50 MB.",
+        unit="MB", least=0.01, most=1e6,
+    )  # fmt: skip
+    part_mb: float = setting(10.0, "One part.", unit="MB", least=0.001, most=1000)
+    sync_s: float = setting(
+        2.0, "What a loss of power costs at most, of bearings; events are forced to the disk at once.",
+        unit="s", least=0.1, most=60,
+    )  # fmt: skip
+    snippets: bool = setting(
+        False, "Whether the sound of each confirmed call is kept too, as WAV that `replay` reads."
+    )
+    before_s: float = setting(
+        3.0, "A snippet begins so long before the call was confirmed.", unit="s", least=0, most=30
+    )
+    after_s: float = setting(
+        1.0, "A snippet ends so long after the track of the call has ended.", unit="s", least=0, most=60
+    )
+    longest_s: float = setting(60.0, "A snippet ends here at the latest.", unit="s", least=0.5, most=3600)
+    snippets_mb: float = setting(
+        500.0, "All snippets; the oldest is deleted for a new one. Three microphones fill 7 MB a minute.",
+        unit="MB", least=0.01, most=1e6,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class Settings:
     """All settings. Every section and every key may be left out."""
 
@@ -426,6 +493,8 @@ class Settings:
     models: ModelsSettings = ModelsSettings()
     mavlink: MavlinkSettings = MavlinkSettings()
     daemon: DaemonSettings = DaemonSettings()
+    record: RecordSettings = RecordSettings()
+    log: LogSettings = LogSettings()
 
     def __post_init__(self) -> None:
         faults = [*_faults_of_fields(self), *_faults_between_fields(self)]
@@ -491,6 +560,15 @@ def _faults_of_value(value: Any, meta: Any) -> Iterator[str]:
 def _faults_between_fields(s: Settings) -> Iterator[str]:
     yield from _faults_of_array(s)
     yield from _faults_of_link(s)
+    snippet_mb = (s.log.longest_s + 1.0) * s.audio.rate_hz * (max(s.audio.channel_map, default=0) + 1) * 4e-6
+    if s.log.snippets and s.log.snippets_mb < snippet_mb + 0.1:
+        yield (
+            f"log.snippets_mb: {s.log.snippets_mb:g} MB is less than one snippet of log.longest_s "
+            f"({snippet_mb + 0.1:.1f} MB)"
+        )
+    for name, section in (("record", s.record), ("log", s.log)):
+        if 2 * section.part_mb > section.total_mb:  # the part being written, and one to give up for it
+            yield f"{name}.total_mb: {section.total_mb:g} MB is less than two parts ({name}.part_mb)"
     if s.audio.rate_hz > 0 and s.daemon.stall_s < 2 * s.hop_s:
         yield f"daemon.stall_s: {s.daemon.stall_s:g} s is less than two hops ({2 * s.hop_s:.3g} s)"
     if s.audio.frame & (s.audio.frame - 1):

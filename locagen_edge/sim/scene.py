@@ -17,7 +17,7 @@ from itertools import count, repeat
 
 import numpy as np
 
-from locagen_edge.framing import Framer, in_real_time
+from locagen_edge.framing import Framer, Tap, as_captured, in_real_time
 from locagen_edge.geometry import angles
 from locagen_edge.settings import Settings
 from locagen_edge.sim.calls import CALLS
@@ -202,16 +202,19 @@ class Tape:
         return np.concatenate([before, sound])
 
 
-def frames(settings: Settings) -> Generator[Frame, None, None]:
+def frames(settings: Settings, tap: Tap | None = None) -> Generator[Frame, None, None]:
     """Frames of the scene without an end, each with its truth, as fast as taken; time counts from 0."""
     audio = settings.audio
     scene = Scene(settings)
     framer = Framer(audio.frame, audio.hop, settings.mic_array.mics, audio.rate_hz)
     while True:
-        for frame in framer.push(scene.render(audio.hop)):
+        block = scene.render(audio.hop)
+        if tap is not None:
+            tap.block(as_captured(block, audio.channel_map), audio.rate_hz, framer.origin_ns)
+        for frame in framer.push(block):
             yield replace(frame, truth=scene.truth(frame.start + audio.frame / 2))
 
 
-def sim(settings: Settings) -> AsyncGenerator[Frame, None]:
+def sim(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Frame, None]:
     """The same in real time."""
-    return in_real_time(frames(settings))
+    return in_real_time(frames(settings, tap))
