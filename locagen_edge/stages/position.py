@@ -32,7 +32,7 @@ from locagen_edge.types import F64, Pose, Position, Sighting
 
 SPACING = 0.3
 """Of the bank's ranges, in logarithm; each filter's 1-sigma is half of it, so that their sum is smooth."""
-STEEP_RAD = 0.6
+STEEP_RAD = 1.0
 """Depression (2 sigma down) from which one look over a height gives a place that is as good as Gaussian."""
 HORIZON_RAD = 1e-3
 """Depression of a level array's answer to delays that no direction explains."""
@@ -94,21 +94,8 @@ class _Look:
     depression: float | None
     """None: no elevation, or no height that it could be measured against"""
     steep: bool
-    bow: float
-    """azimuth from the vehicle's nose"""
-
-    def azimuth_errors(self, row: int) -> dict[int, float]:
-        """What lasting errors from this row of the state on do to the azimuth, as a small rotation of the body."""
-        slope = math.tan(min(max(self.depression or 0.0, 0.0), 1.0))
-        shares = (1.0, -slope * math.cos(self.bow), -slope * math.sin(self.bow))
-        if self.steep:  # across the look, not along the horizon
-            assert self.depression is not None
-            down = math.sin(self.depression)
-            shares = (math.cos(self.depression), -down * math.cos(self.bow), -down * math.sin(self.bow))
-        return dict(zip((row + COMPASS, row + ROLL, row + PITCH), shares, strict=True))
-
-    def elevation_errors(self, row: int) -> dict[int, float]:
-        return {row + ROLL: -math.sin(self.bow), row + PITCH: math.cos(self.bow)}
+    heading: float
+    """in the bank's axes"""
 
 
 @dataclass
@@ -270,7 +257,7 @@ def _look(s: Sighting, origin: tuple[float, float]) -> _Look:
         azimuth=math.atan2(level[1], level[0]),
         depression=depression,
         steep=depression is not None and depression - 2.0 * s.elevation_sigma_rad > STEEP_RAD,
-        bow=s.azimuth_rad - s.heading_rad,
+        heading=math.atan2(level[1], level[0]) - s.azimuth_rad + s.heading_rad,
     )
 
 
@@ -302,24 +289,25 @@ def _born(s: Sighting, settings: PositionSettings) -> _Bank | None:
         per_elevation, per_height = -s.height_m / sine**2, cotangent
         slant = np.array([s.height_m / sine])
         across = slant * _cross_sigma(s, look)
-        per_aside = slant
     else:
         least, most = settings.range_m
         ranges = np.exp(np.arange(math.log(least) + SPACING / 2.0, math.log(most), SPACING))
         noise = ranges * SPACING / 2.0
         per_elevation = per_height = 0.0
         across = ranges * s.azimuth_sigma_rad
-        per_aside = ranges
     filters = len(ranges)
     terrain = np.hypot(settings.terrain_m, settings.terrain_share * ranges)
     # the place as a linear function of the errors: measured azimuth = true + error, vehicle = told + error
     slope = np.zeros((filters, 2, 1 + OWN))
     slope[:, :, 0] = -per_height * ahead
     own = slope[:, :, 1:]
-    for error, share in look.azimuth_errors(0).items():
-        own[:, :, error] -= share * per_aside[:, None] * right
-    for error, share in look.elevation_errors(0).items():
-        own[:, :, error] -= share * per_elevation * ahead
+    bow = look.azimuth - look.heading
+    down = np.full(filters, s.height_m or 0.0)
+    if not look.steep:
+        down = np.minimum(down, 1.5 * ranges)
+    own[:, :, COMPASS] = -ranges[:, None] * right
+    own[:, :, ROLL] = (down * math.cos(bow))[:, None] * right + per_elevation * math.sin(bow) * ahead
+    own[:, :, PITCH] = (down * math.sin(bow))[:, None] * right - per_elevation * math.cos(bow) * ahead
     own[:, 0, NORTH] = own[:, 1, EAST] = 1.0
     own[:, :, HEIGHT] = per_height * ahead
     variance = np.concatenate([terrain[:, None] ** 2, np.tile(_errors(s) ** 2, (filters, 1))], axis=1)
@@ -338,7 +326,7 @@ def _born(s: Sighting, settings: PositionSettings) -> _Bank | None:
     observer = _Observer(SHARED, _errors(s), s, look.here)
     bank = _Bank(origin, s.t_ns, x, p, np.zeros(filters), {s.observer: observer}, observer, s.t_ns)
     if look.depression is not None and not look.steep:
-        fitted = _corrected(bank.x, bank.p, observer, s, _elevation(s, look, observer.row))
+        fitted = _corrected(bank.x, bank.p, observer, s, _rows(s, look, bank.x)[-1])
         bank.x, bank.p, bank.weight = fitted.x, fitted.p, bank.weight + fitted.log_likelihood
     return bank
 
@@ -352,12 +340,13 @@ class _Row:
 
     ahead: F64
     aside: F64
-    """both (3,) unit vectors, north, east, down"""
-    errors: dict[int, float]
-    """state -> its share"""
+    """both (filters or 1, 3) unit vectors, north, east, down"""
+    tilt: F64
+    """(filters or 1, 3): shares of the errors COMPASS, ROLL, PITCH"""
+    measured: float
+    """the angle, or its cosine"""
     sigma: float
-    cosine: float | None = None
-    """None: the angle itself should be 0. Else its cosine should be this; 1: this or more"""
+    cosine: bool = False
 
 
 @dataclass(frozen=True)
@@ -378,42 +367,81 @@ def _cross_sigma(s: Sighting, look: _Look) -> float:
     )
 
 
-def _azimuth(s: Sighting, look: _Look, row: int) -> _Row:
-    cosine, sine = math.cos(look.azimuth), math.sin(look.azimuth)
-    aside = np.array([-sine, cosine, 0.0])
-    ahead, sigma = np.array([cosine, sine, 0.0]), s.azimuth_sigma_rad
+def _rows(s: Sighting, look: _Look, x: F64) -> list[_Row]:
+    """What a sighting measures, as each filter sees it."""
     if look.steep:
-        assert look.depression is not None
-        ahead = math.cos(look.depression) * ahead + np.array([0.0, 0.0, math.sin(look.depression)])
-        sigma = _cross_sigma(s, look)
-    return _Row(ahead, aside, look.azimuth_errors(row), sigma)
+        return _steep_rows(s, look)
+    away = x[:, :2] - look.here
+    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-3)
+    # from where the filter has the caller, not from where the noisy look has: errors that are the same in all
+    # looks must come out the same in all, or the filter believes that it can tell them from the place
+    bow = np.arctan2(away[:, 1], away[:, 0]) - look.heading
+    slope = np.minimum((s.height_m or 0.0) / distance, 1.5)
+    none, one = np.zeros(len(x)), np.ones(len(x))
+    rows = []
+    if s.azimuth_sigma_rad <= BLUNT_RAD:
+        cosine, sine = math.cos(look.azimuth), math.sin(look.azimuth)
+        rows.append(
+            _Row(
+                ahead=np.array([[cosine, sine, 0.0]]),
+                aside=np.array([[-sine, cosine, 0.0]]),
+                tilt=np.stack([one, -slope * np.cos(bow), -slope * np.sin(bow)], axis=1),
+                measured=0.0,
+                sigma=s.azimuth_sigma_rad,
+            )
+        )
+    if look.depression is not None:
+        cosine, sigma = _level_cosine(s, look.depression)
+        level = not math.isnan(cosine)
+        rows.append(
+            _Row(
+                ahead=np.stack([away[:, 0] / distance, away[:, 1] / distance, none], axis=1),
+                aside=np.array([[0.0, 0.0, -1.0]]),
+                tilt=np.stack([none, -np.sin(bow), np.cos(bow)], axis=1),
+                measured=cosine if level else -look.depression,
+                sigma=sigma if level else s.elevation_sigma_rad,
+                cosine=level,
+            )
+        )
+    return rows
 
 
-def _elevation(s: Sighting, look: _Look, row: int) -> _Row:
-    """The elevation's residual: in angle, or in its cosine for a level array, which measures just that.
+def _level_cosine(s: Sighting, depression: float) -> tuple[float, float]:
+    """The cosine of the depression with its 1-sigma where a level array measured it, else NaN.
 
-    Near the horizon the cosine's even noise is anything but even in elevation, and its sigma there depends on the
-    noise itself: taken in angle, looks that err towards the vehicle count for more than those that err away.
-    Noise beyond a cosine of 1 is told as the horizon.
+    Such an array measures just that. Near the horizon the cosine's even noise is anything but even in elevation,
+    and the elevation's sigma depends on the noise itself: taken in angle, looks that err towards the vehicle
+    would count for more than those that err away. Noise beyond a cosine of 1 is told as the horizon.
     """
+    sigma = s.elevation_sigma_rad * max(math.sin(depression), s.azimuth_sigma_rad)
+    if sigma < 0.5 * s.azimuth_sigma_rad * math.cos(depression):
+        return math.nan, sigma  # better than a level array could
+    return 1.0 if depression < HORIZON_RAD else math.cos(depression), sigma
+
+
+def _steep_rows(s: Sighting, look: _Look) -> list[_Row]:
+    """Both residuals on the plane that touches the sphere at the measured direction."""
     assert look.depression is not None
     cosine, sine = math.cos(look.azimuth), math.sin(look.azimuth)
-    level_sigma = s.elevation_sigma_rad * max(math.sin(look.depression), s.azimuth_sigma_rad)
-    if not look.steep and level_sigma >= 0.5 * s.azimuth_sigma_rad * math.cos(look.depression):
-        return _Row(
-            ahead=np.array([cosine, sine, 0.0]),
-            aside=np.array([0.0, 0.0, -1.0]),
-            errors=look.elevation_errors(row),
-            sigma=level_sigma,
-            cosine=1.0 if look.depression < HORIZON_RAD else math.cos(look.depression),
-        )
     level, down = math.cos(look.depression), math.sin(look.depression)
-    return _Row(
-        ahead=np.array([level * cosine, level * sine, down]),
-        aside=np.array([down * cosine, down * sine, -level]),
-        errors=look.elevation_errors(row),
-        sigma=s.elevation_sigma_rad,
-    )
+    bow = look.azimuth - look.heading
+    ahead = np.array([[level * cosine, level * sine, down]])
+    return [
+        _Row(
+            ahead=ahead,
+            aside=np.array([[-sine, cosine, 0.0]]),
+            tilt=np.array([[level, -down * math.cos(bow), -down * math.sin(bow)]]),
+            measured=0.0,
+            sigma=_cross_sigma(s, look),
+        ),
+        _Row(
+            ahead=ahead,
+            aside=np.array([[down * cosine, down * sine, -level]]),
+            tilt=np.array([[0.0, -math.sin(bow), math.cos(bow)]]),
+            measured=0.0,
+            sigma=s.elevation_sigma_rad,
+        ),
+    ]
 
 
 def _corrected(x: F64, p: F64, observer: _Observer, s: Sighting, row: _Row) -> _Corrected:
@@ -422,28 +450,29 @@ def _corrected(x: F64, p: F64, observer: _Observer, s: Sighting, row: _Row) -> _
     pick = np.zeros((3, states))  # from the state to the vector from vehicle to caller
     pick[0, 0] = pick[1, 1] = pick[2, k + HEIGHT] = 1.0
     pick[0, k + NORTH] = pick[1, k + EAST] = pick[2, 2] = -1.0
-    pair = np.stack([row.ahead, row.aside]) @ pick
+    ahead, aside = row.ahead @ pick, row.aside @ pick
     offset = np.array([-observer.here[0], -observer.here[1], s.height_m or 0.0])
-    b, a = (x @ pair.T + np.stack([row.ahead, row.aside]) @ offset).T
+    b = (x * ahead).sum(axis=1) + row.ahead @ offset
+    a = (x * aside).sum(axis=1) + row.aside @ offset
     square = np.maximum(a * a + b * b, 1e-6)
-    h = (b[:, None] * pair[1] - a[:, None] * pair[0]) / square[:, None]
-    radial = (b[:, None] * pair[0] + a[:, None] * pair[1]) / square[:, None]
+    h = (b[:, None] * aside - a[:, None] * ahead) / square[:, None]
+    radial = (b[:, None] * ahead + a[:, None] * aside) / square[:, None]
     angle, slope, bend = np.arctan2(a, b), np.ones(len(a)), -radial
-    value = angle
-    if row.cosine is not None:
-        value, slope = np.cos(angle) - row.cosine, -np.sin(angle)
+    value = angle - row.measured
+    if row.cosine:
+        value, slope = np.cos(angle) - row.measured, -np.sin(angle)
         bend = -0.5 * np.cos(angle)[:, None] * h - slope[:, None] * radial
     # the second derivative is h k' + k h' for h the angle's first derivative and this bend k
     ph, pk = (p @ h[:, :, None])[:, :, 0], (p @ bend[:, :, None])[:, :, 0]
     hh, hk, kk = (h * ph).sum(axis=1), (h * pk).sum(axis=1), (bend * pk).sum(axis=1)
+    own = slice(k, k + 3)
     gain = h.copy()
-    for state, share in row.errors.items():
-        gain[:, state] += share
-        value = value + slope * share * x[:, state]
-        ph = ph + share * p[:, :, state]
-    gain, ph, value = slope[:, None] * gain, slope[:, None] * ph, value + hk
+    gain[:, own] += row.tilt
+    gain *= slope[:, None]
+    value = value + hk + slope * (row.tilt * x[:, own]).sum(axis=1)
+    ph = slope[:, None] * (ph + (p[:, :, own] * row.tilt[:, None, :]).sum(axis=2))
     s2 = (gain * ph).sum(axis=1) + hh * kk + hk * hk + row.sigma**2
-    if row.cosine == 1.0:
+    if row.cosine and row.measured == 1.0:
         beyond = [max(0.5 * math.erfc(-z), 1e-300) for z in value / np.sqrt(2.0 * s2)]
         return _Corrected(x, p, np.log(beyond), np.zeros(len(x)))
     distance2 = value**2 / s2
@@ -465,12 +494,7 @@ def _update(bank: _Bank, s: Sighting, settings: PositionSettings) -> bool:
         x, p = _widened(x, p, observer.sigma)
     observer = _Observer(observer.row, _errors(s), s, look.here)
     weight, taken = bank.weight, 0
-    rows = []
-    if look.steep or s.azimuth_sigma_rad <= BLUNT_RAD:
-        rows.append(_azimuth(s, look, observer.row))
-    if look.depression is not None:
-        rows.append(_elevation(s, look, observer.row))
-    for row in rows:
+    for row in _rows(s, look, x):
         fitted = _corrected(x, p, observer, s, row)
         credible = weight > weight.max() - CREDIBLE
         if fitted.distance2[credible].min() > settings.gate_sigma**2:
