@@ -35,3 +35,7 @@ class KernelError(LocagenError):
 
 class DatasetError(LocagenError):
     """A data set that cannot be written, is not complete, or is not what the settings ask for."""
+
+
+class ExportError(LocagenError):
+    """Sightings that cannot be read, or events that cannot be written."""

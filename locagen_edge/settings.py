@@ -300,7 +300,7 @@ class PositionSettings:
     )
     look_s: float = setting(
         0.2,
-        "Looks of one vehicle at one caller that follow sooner are left out: their noise is that of the last.",
+        "Looks of one vehicle at one caller that follow sooner are left out: their noise is the last one's.",
         unit="s",
         least=0,
         most=60,

@@ -153,8 +153,8 @@ class Pose:
 class Sighting:
     """One look of one vehicle at one caller, in earth axes: what a position is made of.
 
-    What differs from look to look (`..._sigma_rad`) averages out; what is the same in all looks of a vehicle for
-    minutes (`..._bias_sigma...`, the place, the height) does not, and is told apart for that.
+    What differs from look to look (`..._sigma_rad`) averages out; what is the same in all looks of a vehicle
+    for minutes (`..._bias_sigma...`, the place, the height) does not, and is told apart for that.
     """
 
     t_ns: int

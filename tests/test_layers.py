@@ -49,7 +49,8 @@ def test_what_is_not_used_is_not_loaded():
     assert not loaded & {"onnxruntime", "sounddevice", "soundfile", "tqdm"}
 
 
-GROUND = {"types", "geometry", "errors", "settings", "kernel", "models", "framing", "resampling"}
+GROUND = {"types", "geometry", "geodesy", "errors", "files", "settings", "kernel", "models", "framing"}
+GROUND |= {"resampling"}
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
     "stages": GROUND,
@@ -57,6 +58,9 @@ ABOVE = {
     "mavlink": GROUND,
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
+    "export": GROUND,
+    "sightings": GROUND | {"export"},
+    "fusion": GROUND | {"stages"},
     "notify": set(),
     "check": GROUND | {"stages", "mavlink", "pipeline", "sources"},
     "daemon": GROUND | {"stages", "mavlink", "pipeline", "sources", "notify"},

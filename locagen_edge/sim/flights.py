@@ -1,10 +1,10 @@
 """Flights past a caller: sightings as a vehicle would make them, with the caller's true place beside.
 
-Nothing here knows how positions are found. Errors are those of the things themselves: attitude and compass turn
-the direction as a rotation of the body, a level array measures both horizontal direction cosines equally well
-(so azimuths blur towards straight below, elevations towards the horizon, and noise beyond it reads as the
-horizon), GPS and height are off by the same for
-the whole flight, the ground at the caller is higher or lower than below the vehicle, and the caller strays.
+Nothing here knows how positions are found. Errors are those of the things themselves: attitude and compass
+turn the direction as a rotation of the body, a level array measures both horizontal direction cosines equally
+well (so azimuths blur towards straight below, elevations towards the horizon, and noise beyond it reads as
+the horizon), GPS and height are off by the same for the whole flight, the ground at the caller is higher or
+lower than below the vehicle, and the caller strays.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 
 from locagen_edge import geodesy
 from locagen_edge.types import F64, Sighting
+
 
 @dataclass(frozen=True)
 class Errors:
@@ -58,18 +59,27 @@ class Flight:
     longitude_deg: float
     caller_m: F64 = field(repr=False)
     """(looks, 2) north, east of the origin"""
+    rise_m: float
+    """of the ground at the caller over that below the vehicle"""
 
 
-def line(seconds: float, rate_hz: float, start_m: F64, speed_m_s: float, course_rad: float, height_m: float) -> Path:
+def line(
+    seconds: float, rate_hz: float, start_m: F64, speed_m_s: float, course_rad: float, height_m: float
+) -> Path:
     """A straight leg with the nose along it; speed 0 is a hover."""
     time = np.arange(round(seconds * rate_hz)) / rate_hz
     course = np.array([math.cos(course_rad), math.sin(course_rad)])
     return Path(
-        time, start_m + speed_m_s * time[:, None] * course, np.full(len(time), height_m), np.full(len(time), course_rad)
+        time,
+        start_m + speed_m_s * time[:, None] * course,
+        np.full(len(time), height_m),
+        np.full(len(time), course_rad),
     )
 
 
-def orbit(seconds: float, rate_hz: float, centre_m: F64, radius_m: float, speed_m_s: float, height_m: float) -> Path:
+def orbit(
+    seconds: float, rate_hz: float, centre_m: F64, radius_m: float, speed_m_s: float, height_m: float
+) -> Path:
     """An arc, clockwise from its north, with the nose to its centre."""
     time = np.arange(round(seconds * rate_hz)) / rate_hz
     angle = speed_m_s / radius_m * time
@@ -89,17 +99,20 @@ def fly(
     ground_m: float = 400.0,
     elevations: bool = True,
     heights: bool = True,
+    like: Flight | None = None,
 ) -> Flight:
     """Sightings along a path of a caller who begins `caller_m` (2,) north and east of `origin` (degrees).
 
-    `ground_m` is the altitude of the ground below the vehicle. A `caller_m` of shape (looks, 2) is taken as it is:
-    several vehicles see one caller by it.
+    `ground_m` is the altitude of the ground below the vehicle. `like`: the flight of another vehicle with as
+    many looks, whose caller, walk and ground are the same.
     """
     step = np.diff(path.time_s, prepend=path.time_s[0])
     strays = errors.walk_m * np.sqrt(step)[:, None] * rng.standard_normal((len(step), 2))
-    true = caller_m if caller_m.ndim == 2 else caller_m + np.cumsum(strays, axis=0)
-    distance = math.hypot(*(true[0] - path.place_m[0]))
+    distance = math.hypot(*(caller_m - path.place_m[0]))
     rise = math.hypot(errors.terrain_m, errors.terrain_share * distance) * rng.standard_normal()
+    true = caller_m + np.cumsum(strays, axis=0)
+    if like is not None:
+        rise, true = like.rise_m, like.caller_m
     offset = errors.gps_m * rng.standard_normal(2)
     lift = errors.height_m * rng.standard_normal()
     compass = errors.compass_rad * rng.standard_normal()
@@ -140,7 +153,35 @@ def fly(
             )
         )
     lat, lon, _ = geodesy.moved(*origin, 0.0, np.array([true[-1, 0], true[-1, 1], 0.0]))
-    return Flight(tuple(sightings), lat, lon, true)
+    return Flight(tuple(sightings), lat, lon, true, rise)
+
+
+def drawn(rng: np.random.Generator) -> Flight:
+    """A flight of any kind: a leg, a hover, an orbit, a leg without elevations; 6 to 15 s at 2 looks a
+    second, 10 to 50 m high, a caller 8 to 120 m away, with good and bad sensors."""
+    errors = Errors(
+        cosine_rad=math.radians(rng.uniform(0.5, 4.0)),
+        compass_rad=math.radians(rng.uniform(0.5, 4.0)),
+        tilt_rad=math.radians(rng.uniform(0.3, 2.0)),
+        gps_m=rng.uniform(0.5, 3.0),
+        height_m=rng.uniform(0.2, 2.0),
+    )
+    azimuth, course = rng.uniform(0.0, 2.0 * math.pi, 2)
+    caller = math.exp(rng.uniform(math.log(8.0), math.log(120.0))) * np.array(
+        [math.cos(azimuth), math.sin(azimuth)]
+    )
+    height, seconds, kind = rng.uniform(10.0, 50.0), rng.uniform(6.0, 15.0), rng.integers(4)
+    if kind == 0:
+        path = line(seconds, 2.0, np.zeros(2), rng.uniform(2.0, 8.0), course, height)
+    elif kind == 1:
+        path = line(seconds, 2.0, np.zeros(2), 0.0, course, height)
+    elif kind == 2:
+        centre = caller + rng.normal(0.0, 5.0, 2)
+        path = orbit(seconds, 2.0, centre, rng.uniform(15.0, 50.0), rng.uniform(2.0, 8.0), height)
+    else:
+        aside = azimuth + rng.choice([-1.0, 1.0]) * rng.uniform(0.7, 1.6)
+        path = line(seconds, 2.0, np.zeros(2), rng.uniform(4.0, 10.0), aside, height)
+    return fly(path, caller, errors, rng, elevations=bool(kind != 3))
 
 
 def _turned(vector: F64, rotation: F64) -> F64:

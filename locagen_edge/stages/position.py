@@ -1,22 +1,24 @@
-"""Sighting -> Position: callers on the map, from bearings along the flight, depression over height, many vehicles.
+"""Sighting -> Position: callers on the map, from bearings along the flight and depression over height.
 
 A single bearing is a ray without an end, and no Gaussian in metres is like one. So a bank of extended Kalman
 filters stands along the first ray, each with its own range, every one narrow enough for its linearisation to
 hold; the looks that follow decide between them by likelihood (Peach, "Bearings-only tracking using a set of
-range-parameterised extended Kalman filters", IEE Proc. Control Theory Appl. 142, 1995). Place and covariance are
-the mean and the moments of the whole bank. A vehicle that hovers and knows no height leaves the bank as broad as it
-began: the range is not observable, and no place is told. Against the paper: each update also carries the
-second-order term of the angle (Bar-Shalom, Li & Kirubarajan, *Estimation with Applications to Tracking and
-Navigation*, section 10.3.2), without which a filter that passes close by believes itself too much.
+range-parameterised extended Kalman filters", IEE Proc. Control Theory Appl. 142, 1995). Place and covariance
+are the mean and the moments of the whole bank. A vehicle that hovers and knows no height leaves the bank as
+broad as it began: the range is not observable, and no place is told. Against the paper: each update also
+carries the second-order term of the angle (Bar-Shalom, Li & Kirubarajan, *Estimation with Applications to
+Tracking and Navigation*, section 10.3.2), without which a filter that passes close by believes itself too
+much.
 
-What is the same in all looks of a vehicle is part of the state, with its covariance: compass, attitude about the
-body's two level axes, place and height of the vehicle, and the height of the ground at the caller. These decay
-slowly to zero and are renewed as fast (first-order Gauss-Markov). As states, and not as wider sigmas of the
-looks, they do not average out over a hundred looks; and where a second vehicle or a curved path tells a compass
-error, it is learnt. (A Schmidt filter, which only considers them, gives that away and saves no work here.)
+What is the same in all looks of a vehicle is part of the state, with its covariance: compass, attitude about
+the body's two level axes, place and height of the vehicle, and the height of the ground at the caller. These
+decay slowly to zero and are renewed as fast (first-order Gauss-Markov). As states, and not as wider sigmas of
+the looks, they do not average out over a hundred looks; and where a second vehicle or a curved path tells a
+compass error, it is learnt. (A Schmidt filter, which only considers them, gives that away and saves no work
+here.)
 
-Looks are residuals on the plane that touches the sphere of directions at the measured one, so nothing is singular
-straight below, where azimuth means nothing.
+A steep look is a residual on the plane that touches the sphere of directions at the measured one, so nothing
+is singular straight below, where azimuth means nothing; a flat one that of azimuth and elevation's cosine.
 """
 
 from __future__ import annotations
@@ -46,13 +48,15 @@ CREDIBLE = 7.0
 """Filters further than this below the best in log-likelihood have no say in what is an outlier."""
 DEAD = 25.0
 """Filters further than that below the best are dropped: one in a hundred thousand million."""
+ANYWHERE = -math.log(2.0 * math.pi)
+"""Log-likelihood of a direction that nothing foretells; that of its elevation is near 0."""
 LOST_AFTER = 5
 """Looks in a row outside the gate after which the filter begins again with them."""
 OBSERVERS = 8
 """Vehicles in one filter; it costs with the square of them."""
 
 SHARED = 3
-"""States that belong to the caller: north, east, height of the ground at the caller over that below the vehicle."""
+"""States of the caller: north, east, height of the ground there over that below the vehicle."""
 COMPASS, ROLL, PITCH, NORTH, EAST, HEIGHT = range(6)
 """Errors of one vehicle: its attitude, its place, its height."""
 OWN = 6
@@ -71,13 +75,16 @@ class _Observer:
 
 @dataclass
 class _Bank:
-    """All filters of one caller. `x` (filters, states), `p` (filters, states, states), `weight` (filters,) logarithms."""
+    """All filters of one caller, at one time."""
 
     origin: tuple[float, float]
     t_ns: int
     x: F64
+    """(filters, states)"""
     p: F64
+    """(filters, states, states)"""
     weight: F64
+    """(filters,) logarithms"""
     observers: dict[str, _Observer]
     last: _Observer
     looked_ns: int
@@ -119,6 +126,8 @@ class Positioner:
 
     settings: PositionSettings
     counters: Counters = field(default_factory=Counters)
+    evidence: float = 0.0
+    """log-likelihood of all that was seen, given what was seen before: what two readings of it compare by"""
     _banks: dict[int, _Bank] = field(default_factory=dict)
 
     def see(self, sighting: Sighting) -> bool:
@@ -143,10 +152,13 @@ class Positioner:
         elif len(bank.observers) == OBSERVERS:
             self.counters.unusable += 1
             return False
-        if _update(bank, sighting, self.settings):
+        gain = _update(bank, sighting, self.settings)
+        if gain is not None:
             self.counters.used += 1
+            self.evidence += gain
             return True
         self.counters.outside += 1
+        self.evidence += ANYWHERE
         if bank.outside >= LOST_AFTER:
             self.counters.restarts += 1
             return self._begin(sighting)
@@ -177,6 +189,7 @@ class Positioner:
             del self._banks[min(self._banks, key=lambda caller: self._banks[caller].looked_ns)]
         self._banks[sighting.caller] = bank
         self.counters.used += 1
+        self.evidence += ANYWHERE
         return True
 
 
@@ -191,7 +204,10 @@ def sighting(
     elevation_rad: float | None = None,
     elevation_sigma_rad: float = 0.0,
 ) -> Sighting | None:
-    """A look in earth axes from a vehicle's pose, with the settings' errors; None where the pose knows no place."""
+    """A look, its angles in earth axes, from a vehicle's pose, with the settings' lasting errors.
+
+    None where the pose knows no place.
+    """
     if pose.latitude_deg is None or pose.longitude_deg is None:
         return None
     return Sighting(
@@ -225,11 +241,11 @@ def _heading(pose: Pose) -> float:
 
 
 def _usable(s: Sighting) -> bool:
-    numbers = (
-        s.latitude_deg, s.longitude_deg, s.azimuth_rad, s.azimuth_sigma_rad, s.height_sigma_m,
-        s.position_sigma_m, s.heading_rad, s.azimuth_bias_sigma_rad, s.elevation_bias_sigma_rad, s.altitude_m or 0.0, s.height_m or 0.0,
-        s.elevation_rad or 0.0, s.elevation_sigma_rad if s.elevation_rad is not None else 0.0,
-    )  # fmt: skip
+    numbers = [
+        getattr(s, name)
+        for name in Sighting.__slots__
+        if name not in ("observer", "caller") and getattr(s, name) is not None
+    ]
     sigmas = (s.height_sigma_m, s.position_sigma_m, s.azimuth_bias_sigma_rad, s.elevation_bias_sigma_rad)
     return (
         all(math.isfinite(number) for number in numbers)
@@ -273,7 +289,7 @@ def _errors(s: Sighting) -> F64:
 
 
 def _born(s: Sighting, settings: PositionSettings) -> _Bank | None:
-    """The bank along the first ray, or one filter where the first look is steep; None: too vague for either."""
+    """The bank along the first ray, one filter where the first look is steep, None where it is too vague."""
     origin = (s.latitude_deg, s.longitude_deg)
     look = _look(s, origin)
     if not look.steep and math.hypot(s.azimuth_sigma_rad, s.azimuth_bias_sigma_rad) > BLUNT_RAD:
@@ -336,7 +352,7 @@ def _born(s: Sighting, settings: PositionSettings) -> _Bank | None:
 
 @dataclass(frozen=True)
 class _Row:
-    """One scalar residual: the angle of the line of sight from `ahead` towards `aside`, plus lasting errors."""
+    """One scalar residual: the angle of the line of sight from `ahead` towards `aside`."""
 
     ahead: F64
     aside: F64
@@ -359,8 +375,11 @@ class _Corrected:
 
 
 def _cross_sigma(s: Sighting, look: _Look) -> float:
-    """1-sigma of the direction across a steep look. A level array's azimuth is worth sigma / cos and its elevation
-    sigma / sin of the depression: each gives that sigma, and at the zenith only the second does."""
+    """1-sigma of the direction across a steep look, radians.
+
+    A level array's azimuth is worth sigma / cos and its elevation sigma / sin of the depression: each gives
+    that sigma, and straight below only the second does.
+    """
     assert look.depression is not None
     return max(
         s.azimuth_sigma_rad * math.cos(look.depression), s.elevation_sigma_rad * math.sin(look.depression)
@@ -409,9 +428,10 @@ def _rows(s: Sighting, look: _Look, x: F64) -> list[_Row]:
 def _level_cosine(s: Sighting, depression: float) -> tuple[float, float]:
     """The cosine of the depression with its 1-sigma where a level array measured it, else NaN.
 
-    Such an array measures just that. Near the horizon the cosine's even noise is anything but even in elevation,
-    and the elevation's sigma depends on the noise itself: taken in angle, looks that err towards the vehicle
-    would count for more than those that err away. Noise beyond a cosine of 1 is told as the horizon.
+    Such an array measures just that. Near the horizon the cosine's even noise is anything but even in
+    elevation, and the elevation's sigma depends on the noise itself: taken in angle, looks that err towards
+    the vehicle would count for more than those that err away. Noise beyond a cosine of 1 is told as the
+    horizon.
     """
     sigma = s.elevation_sigma_rad * max(math.sin(depression), s.azimuth_sigma_rad)
     if sigma < 0.5 * s.azimuth_sigma_rad * math.cos(depression):
@@ -479,13 +499,16 @@ def _corrected(x: F64, p: F64, observer: _Observer, s: Sighting, row: _Row) -> _
     return _Corrected(
         x=x - ph * (value / s2)[:, None],
         p=p - ph[:, :, None] * (ph / s2[:, None])[:, None, :],
-        log_likelihood=-0.5 * (distance2 + np.log(s2)),
+        log_likelihood=-0.5 * (distance2 + np.log(2.0 * math.pi * s2)),
         distance2=distance2,
     )
 
 
-def _update(bank: _Bank, s: Sighting, settings: PositionSettings) -> bool:
-    """Takes a sighting into the bank; False: it is outside the gate, and the bank is as it was."""
+def _update(bank: _Bank, s: Sighting, settings: PositionSettings) -> float | None:
+    """Takes a sighting into the bank and gives its log-likelihood.
+
+    None: it is outside the gate, and the bank is as it was.
+    """
     look = _look(s, bank.origin)
     x, p = _predicted(bank, s.t_ns, settings)
     observer = bank.observers.get(s.observer)
@@ -499,11 +522,12 @@ def _update(bank: _Bank, s: Sighting, settings: PositionSettings) -> bool:
         credible = weight > weight.max() - CREDIBLE
         if fitted.distance2[credible].min() > settings.gate_sigma**2:
             bank.outside += 1
-            return False
+            return None
         x, p, weight = fitted.x, fitted.p, weight + fitted.log_likelihood
         taken += 1
     if not taken:
-        return False
+        return None
+    gain = _log_sum(weight) - _log_sum(bank.weight)
     live = weight > weight.max() - DEAD
     live[-1] = True  # the furthest stays: it tells whether the caller may be beyond the bank
     bank.x, bank.p, bank.weight = x[live], p[live], weight[live] - weight.max()
@@ -512,7 +536,12 @@ def _update(bank: _Bank, s: Sighting, settings: PositionSettings) -> bool:
     bank.observers[s.observer] = bank.last = observer
     bank.looks += 1
     bank.outside = 0
-    return True
+    return gain
+
+
+def _log_sum(weight: F64) -> float:
+    most = float(weight.max())
+    return most + math.log(float(np.exp(weight - most).sum()))
 
 
 def _predicted(bank: _Bank, t_ns: int, settings: PositionSettings) -> tuple[F64, F64]:
