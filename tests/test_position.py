@@ -124,6 +124,21 @@ def test_errors_are_as_large_as_the_covariance_says_over_500_flights():
     assert abs(np.mean(np.array(values) < 5.99) - 0.95) < 3.0 * math.sqrt(0.95 * 0.05 / n)
 
 
+def test_a_pass_close_by_is_no_more_certain_than_it_is_right():
+    """Where the bearing swings by 90 degrees within a look, and no tangent to it holds."""
+    rng = np.random.default_rng(22)
+    values = []
+    for _ in range(40):
+        path = line(20.0, 2.0, np.array([-50.0, 2.0]), 5.0, 0.0, 25.0)
+        errors = Errors(cosine_rad=math.radians(2.0), gps_m=0.5)
+        flight = fly(path, np.zeros(2), errors, rng, elevations=False)
+        position = found(flight)
+        values.append(
+            normalised_error(flight, position.latitude_deg, position.longitude_deg, position.covariance_m2)
+        )
+    assert np.mean(values) < 2.0 + 1.96 * 2.0 / math.sqrt(len(values))
+
+
 def test_two_vehicles_are_as_certain_as_they_are_right_and_better_than_one():
     rng = np.random.default_rng(5)
     values, one, two = [], [], []

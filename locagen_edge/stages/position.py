@@ -7,8 +7,8 @@ range-parameterised extended Kalman filters", IEE Proc. Control Theory Appl. 142
 are the mean and the moments of the whole bank. A vehicle that hovers and knows no height leaves the bank as
 broad as it began: the range is not observable, and no place is told. Against the paper: each update also
 carries the second-order term of the angle (Bar-Shalom, Li & Kirubarajan, *Estimation with Applications to
-Tracking and Navigation*, section 10.3.2), without which a filter that passes close by believes itself too
-much.
+Tracking and Navigation*, section 10.3.2). Without it bearings from a vehicle that passes 2 m beside a caller
+give a normalised error squared of 3.5 instead of 2.
 
 What is the same in all looks of a vehicle is part of the state, with its covariance: compass, attitude about
 the body's two level axes, place and height of the vehicle, and the height of the ground at the caller. These
