@@ -4,9 +4,8 @@
 
 The mean normalised error squared is 2 where covariances are true. Beside the filter as it flies stand what it
 would be without its parts: one filter instead of the bank along the first ray (at the middle of the logarithm
-of ranges, as uncertain as all of them), and errors of compass, attitude, GPS and height taken for noise of
-each look (added to its sigma). The figure shows one flight of bearings alone past a caller, with 95 %
-ellipses.
+of ranges, as uncertain as all of them), and errors of compass and attitude taken for noise of each look
+(added to its sigma). The figure shows one flight of bearings alone past a caller, with 95 % ellipses.
 """
 
 import argparse
@@ -51,7 +50,7 @@ def as_it_is(look: Sighting) -> Sighting:
 
 
 def as_noise(look: Sighting) -> Sighting:
-    """Lasting errors as if they were each look's own."""
+    """Errors of compass and attitude as if they were each look's own."""
     return replace(
         look,
         azimuth_sigma_rad=math.hypot(look.azimuth_sigma_rad, look.azimuth_bias_sigma_rad),
@@ -164,7 +163,7 @@ def main() -> None:
         "50 m away, 20 m of path, bearings alone": judged(passing, flights),
         "hover 20 m high, 30 m out": judged(hovering, flights),
         "any flight": judged(drawn, flights),
-        "any flight, lasting errors as noise": judged(drawn, flights, as_noise),
+        "any flight, compass and attitude as noise": judged(drawn, flights, as_noise),
     }
     with one_filter():
         results["any flight, one filter"] = judged(drawn, flights)
