@@ -175,6 +175,20 @@ def _parser() -> argparse.ArgumentParser:
         "--format", choices=("table", "jsonl"), default="table", help="a table (default) or the records"
     )
 
+    fuse = command(
+        "fuse",
+        _fuse,
+        "find callers on the map from the sightings of one or several vehicles",
+        "Reads JSON lines, one sighting each, and prints one line per caller: place, 1-sigma ellipse, and "
+        "which vehicles saw it. With -o also a map file.",
+    )
+    fuse.add_argument(
+        "files", type=Path, nargs="+", metavar="FILE.jsonl", help="sightings, any number of files"
+    )
+    fuse.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="map file: .geojson, .kml or .gpx says the format"
+    )
+
     command(
         "devices",
         _devices,
@@ -606,6 +620,37 @@ def _log(arguments: argparse.Namespace) -> int:
     except PermissionError:
         raise StorageError(f"{directory}: may not be read: as root, or the user locagen-edge") from None
     sys.stdout.flush()
+    return 0
+
+
+# --- fuse ---------------------------------------------------------------------------------------------
+
+
+def _fuse(arguments: argparse.Namespace) -> int:
+    from locagen_edge.export import event, export
+    from locagen_edge.fusion import fuse
+    from locagen_edge.sightings import read
+
+    found = fuse((look for path in arguments.files for look in read(path)), _settings(arguments).position)
+    events = []
+    for number, fused in enumerate(found, start=1):
+        p = fused.position
+        if p.latitude_deg is None or p.longitude_deg is None:
+            azimuth, sigma = compass_deg(p.azimuth_rad), math.degrees(p.azimuth_sigma_rad)
+            place = f"range not observable; {azimuth:.1f}° ±{sigma:.1f}° from the last look"
+        else:
+            place = (
+                f"{p.latitude_deg:.6f}, {p.longitude_deg:.6f}  1-sigma {p.semi_major_m:.1f} m x "
+                f"{p.semi_minor_m:.1f} m at {math.degrees(p.orientation_rad):.0f}°"
+            )
+            told = event(p, p.t_ns, name=f"caller {number}")
+            events += [told] if told is not None else []
+        seen = ", ".join(f"{observer}/{caller}" for observer, caller in fused.streams)
+        print(f"caller {number}: {place}  ({fused.used} looks of {seen}; {fused.unused} not used)")
+    if not found:
+        print("no caller: no sighting could be used")
+    if arguments.output is not None:
+        export(events, arguments.output)
     return 0
 
 

@@ -43,3 +43,7 @@ class CalibrationError(LocagenError):
 
 class StorageError(LocagenError):
     """A folder or disk that cannot be written to, or has no room left."""
+
+
+class ExportError(LocagenError):
+    """Sightings that cannot be read, or events that cannot be written."""

@@ -357,6 +357,79 @@ class PoseSettings:
 
 
 @dataclass(frozen=True)
+class PositionSettings:
+    """From bearings along the flight to a place on the map."""
+
+    range_m: tuple[float, ...] = setting(
+        (2.0, 1000.0),
+        "Least and greatest horizontal distance at which a caller may be; every doubling between them is as "
+        "likely as any other. The second well beyond what can be heard: a caller near it has no position.",
+        unit="m",
+        least=0.5,
+        most=20000,
+    )
+    look_s: float = setting(
+        0.2,
+        "Looks of one vehicle at one caller that follow sooner are left out: their noise is the last one's.",
+        unit="s",
+        least=0,
+        most=60,
+    )
+    compass_deg: float = setting(
+        2.0, "1-sigma of the vehicle's heading: the same in all looks, no average takes it away.",
+        unit="degrees", least=0, most=45,
+    )  # fmt: skip
+    tilt_deg: float = setting(
+        1.0, "1-sigma of attitude and mounting about either horizontal axis.",
+        unit="degrees", least=0, most=45,
+    )  # fmt: skip
+    gps_m: float = setting(
+        1.5, "1-sigma of the vehicle's place, per axis; it goes into the caller's whole.",
+        unit="m", least=0, most=1000,
+    )  # fmt: skip
+    bias_s: float = setting(
+        300.0,
+        "How long an error of compass, attitude, GPS and height lasts before it is another.",
+        unit="s",
+        least=1,
+        most=1e6,
+    )
+    terrain_m: float = setting(
+        1.0,
+        "1-sigma of the ground's height (or of the floor) at the caller against that below the vehicle.",
+        unit="m",
+        least=0,
+        most=1000,
+    )
+    terrain_share: float = setting(
+        0.03, "The same, per metre of distance: 0.03 is 3 m at 100 m. Hills need more.", least=0, most=1
+    )
+    walk_m: float = setting(
+        0.1,
+        "How far a caller strays, per square root of a second: 0.1 is 0.8 m in a minute, 1 is 8 m.",
+        unit="m/s^0.5",
+        least=0,
+        most=100,
+    )
+    gate_sigma: float = setting(
+        4.0, "Looks further off than this count as another sound.", unit="sigma", least=2, most=100
+    )
+    told_share: float = setting(
+        0.3,
+        "A place is told where the ellipse's longer semi-axis (1-sigma) is at most this share of the "
+        "distance, or 10 m; else the range counts as not observable.",
+        least=0.01,
+        most=1,
+    )
+    forget_s: float = setting(
+        120.0, "A place is kept for so long after the last look.", unit="s", least=1, most=1e5
+    )
+    callers: int = setting(
+        8, "Callers followed at once; beyond that the longest unheard is forgotten.", least=1, most=1000
+    )
+
+
+@dataclass(frozen=True)
 class ModelsSettings:
     """ONNX models."""
 
@@ -490,6 +563,7 @@ class Settings:
     detection: DetectionSettings = DetectionSettings()
     track: TrackSettings = TrackSettings()
     pose: PoseSettings = PoseSettings()
+    position: PositionSettings = PositionSettings()
     models: ModelsSettings = ModelsSettings()
     mavlink: MavlinkSettings = MavlinkSettings()
     daemon: DaemonSettings = DaemonSettings()
@@ -569,6 +643,8 @@ def _faults_between_fields(s: Settings) -> Iterator[str]:
     for name, section in (("record", s.record), ("log", s.log)):
         if 2 * section.part_mb > section.total_mb:  # the part being written, and one to give up for it
             yield f"{name}.total_mb: {section.total_mb:g} MB is less than two parts ({name}.part_mb)"
+    if len(s.position.range_m) != 2 or not 1.5 * s.position.range_m[0] < s.position.range_m[1]:
+        yield f"position.range_m: {list(s.position.range_m)} is not a least and a greatest distance"
     if s.audio.rate_hz > 0 and s.daemon.stall_s < 2 * s.hop_s:
         yield f"daemon.stall_s: {s.daemon.stall_s:g} s is less than two hops ({2 * s.hop_s:.3g} s)"
     if s.audio.frame & (s.audio.frame - 1):

@@ -61,7 +61,7 @@ def recording(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["run"], ["replay"], ["record"], ["log"], ["devices"], ["check"], ["calibrate"]]
+    "command", [[], ["run"], ["replay"], ["record"], ["log"], ["fuse"], ["devices"], ["check"], ["calibrate"]]
 )
 def test_help_is_there(command):
     done = cli(*command, "--help")

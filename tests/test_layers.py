@@ -54,6 +54,7 @@ def test_what_is_not_used_is_not_loaded():
 GROUND = {
     "types",
     "geometry",
+    "geodesy",
     "errors",
     "settings",
     "kernel",
@@ -72,6 +73,9 @@ ABOVE = {
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
     "store": GROUND,
+    "export": GROUND,
+    "sightings": GROUND | {"export"},
+    "fusion": GROUND | {"stages"},
     "notify": set(),
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},
