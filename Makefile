@@ -10,7 +10,8 @@ endif
 BIN    := $(VENV)/bin
 CFLAGS_C := -std=gnu11 -Wall -Wextra -Werror -fno-math-errno -fno-trapping-math
 KERNEL_C := $(filter-out csrc/test_kernel.c, $(wildcard csrc/*.c))
-KERNEL := $(wildcard csrc/*.c csrc/*.h) csrc/build_kernel.py setup.py pyproject.toml
+KERNEL := $(wildcard csrc/*.c csrc/*.h) csrc/build_kernel.py setup.py pyproject.toml \
+    locagen_edge/mavlink/locagen.xml locagen_edge/mavlink/build_dialect.py
 SYSTEMD_DIR := /lib/systemd/system
 SYSUSERS_DIR := /usr/lib/sysusers.d
 LIB_DIR := /opt/locagen-edge
@@ -128,7 +129,7 @@ install: ## as root: program, unit, user and sample settings; DESTDIR is honoure
 	$(PYTHON) -m venv $(DESTDIR)$(LIB_DIR)
 	@# built from a copy: root leaves nothing behind in the checkout
 	@copy=$$(mktemp -d) && cp -r csrc locagen_edge models pyproject.toml setup.py MANIFEST.in README.md LICENSE $$copy && \
-	    rm -f $$copy/locagen_edge/*.so && $(DESTDIR)$(LIB_DIR)/bin/pip install -q $$copy; ok=$$?; rm -rf $$copy; exit $$ok
+	    rm -f $$copy/locagen_edge/*.so $$copy/locagen_edge/mavlink/_messages.py && $(DESTDIR)$(LIB_DIR)/bin/pip install -q $$copy; ok=$$?; rm -rf $$copy; exit $$ok
 	@# scripts name their interpreter: the place where it will be, not where it is packed
 	@test -z "$(DESTDIR)" || grep -rlI '^#!$(DESTDIR)' $(DESTDIR)$(LIB_DIR)/bin | xargs -r sed -i '1s|^#!$(DESTDIR)|#!|'
 	install -m 644 systemd/locagen-edge.service $(DESTDIR)$(SYSTEMD_DIR)/
@@ -145,4 +146,4 @@ uninstall: ## removes all that install brought; the settings stay
 
 .PHONY: clean
 clean: ## removes what was built, the virtual environment too
-	rm -rf build dist *.egg-info $(VENV) locagen_edge/*.so
+	rm -rf build dist *.egg-info $(VENV) locagen_edge/*.so locagen_edge/mavlink/_messages.py

@@ -3,6 +3,7 @@
     bytes -> framer -> component -> bytes          I/O-free, time passed in
                link: opens, keeps and reopens the way those bytes travel
             dialect: the one file that names the generated MAVLink code
+            records: a whole bearing or position in one message
 
 Every file has one idea, so that what comes later (parameters, commands, signing, several links) finds its
 place: what we say in `component`, how it is packed and signed in `dialect`, the road in `link`.
