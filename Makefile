@@ -76,6 +76,7 @@ check: $(VENV)/.dev ## lint, format, types: what CI runs before the tests
 format: $(VENV)/.dev ## rewrites the sources in the one format, the sample settings from their one source
 	$(BIN)/ruff check --fix -q . ; $(BIN)/ruff format .
 	$(BIN)/python -m locagen_edge.settings > systemd/locagen-edge.toml.tmp && mv systemd/locagen-edge.toml.tmp systemd/locagen-edge.toml
+	$(BIN)/python -m locagen_edge.mavlink.build_dialect --docs docs/mavlink.md
 
 $(VENV)/.dev: $(VENV)/.flight
 	@echo "setting up $(VENV) for development (once)"
@@ -114,6 +115,11 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 .PHONY: models
 models: $(VENV)/.dev ## trains the models anew
 	$(BIN)/locagen-lab train --settings models/tdoa-mlp.toml --name tdoa-mlp --models models --out build/tdoa-mlp
+
+.PHONY: wireshark
+wireshark: $(VENV)/.dev ## a Wireshark dissector of all our messages, build/locagen.lua
+	@mkdir -p build
+	$(BIN)/python -m locagen_edge.mavlink.build_dialect --lua build/locagen.lua
 
 .PHONY: paper
 paper: $(VENV)/.dev ## repeats the paper's experiments, into paper-report/ (some minutes)

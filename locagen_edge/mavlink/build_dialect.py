@@ -1,7 +1,8 @@
 """Makes `_messages.py`: the MAVLink messages that this program reads or sends, and no others.
 
     python -m locagen_edge.mavlink.build_dialect              _messages.py, as the build does
-    python -m locagen_edge.mavlink.build_dialect --lua FILE   a Wireshark dissector of the same messages
+    python -m locagen_edge.mavlink.build_dialect --lua FILE   a Wireshark dissector: all of common, and ours
+    python -m locagen_edge.mavlink.build_dialect --docs FILE  the field tables between FILE's two marks
 
 A build tool: nothing that flies imports it. pymavlink, which it needs, brings MAVLink's definitions (XML) and
 their generator along. `common` would be 230 messages, in twice the time and memory. Texts are left out of the
@@ -61,6 +62,8 @@ MESSAGES = (
 )
 """taken from common.xml and what it includes; all of `OWN_XML` comes on top"""
 
+BEGIN, END = "<!-- tables: made from locagen.xml by `make format` -->", "<!-- tables: end -->"
+
 ENUMS = ("MAV_COMPONENT",)
 """beside those that a field of the messages names"""
 
@@ -115,8 +118,8 @@ def with_includes(path: Path) -> list[Path]:
     return found
 
 
-def slim(sources: list[Path], *, texts: bool) -> ET.Element:
-    """One definition that includes nothing: `MESSAGES`, our own, and the enums that they name."""
+def slim(sources: list[Path]) -> ET.Element:
+    """One definition that includes nothing and says nothing: `MESSAGES`, our own, and the enums they name."""
     roots = [ET.parse(path).getroot() for path in sources]
     own = ET.parse(OWN_XML).getroot()
     known = {str(message.get("name")): message for root in roots for message in root.iter("message")}
@@ -125,16 +128,24 @@ def slim(sources: list[Path], *, texts: bool) -> ET.Element:
     chosen = [*(known[name] for name in MESSAGES), *own.iter("message")]
     named = {str(field.get("enum")) for message in chosen for field in message.iter("field")} | {*ENUMS}
     result = ET.Element("mavlink")
-    ET.SubElement(result, "version").text = "3"
     enums = ET.SubElement(result, "enums")
     for root in (*roots, own):
         for enum in root.iter("enum"):
             if enum.get("name") in named:
                 enums.append(_cut(enum))
     ET.SubElement(result, "messages").extend(chosen)
-    if not texts:
-        for element in result.iter():
-            element.text = element.text if element.tag == "version" else None
+    for element in result.iter():
+        element.text = None
+    ET.SubElement(result, "version").text = "3"
+    return result
+
+
+def whole(definition: Path) -> ET.Element:
+    """A definition that includes all of `definition` and ours."""
+    result = ET.Element("mavlink")
+    for path in (definition, OWN_XML):
+        ET.SubElement(result, "include").text = str(path)
+    ET.SubElement(result, "messages")
     return result
 
 
@@ -157,19 +168,61 @@ def _in_place(path: Path) -> Iterator[Path]:
         os.replace(written, path)
 
 
-def generate(path: Path = MODULE, language: str = "Python3", *, texts: bool = False) -> None:
+def generate(path: Path = MODULE, language: str = "Python3") -> None:
     """Writes the messages in `language` (mavgen's name for it). Raises `SystemExit` with a reason."""
-    sources = with_includes(definitions() / "common.xml")
+    common = definitions() / "common.xml"
     from pymavlink.generator import mavgen
 
+    root = slim(with_includes(common)) if language == "Python3" else whole(common)
     with tempfile.TemporaryDirectory() as folder, _in_place(path) as output:
         xml = Path(folder) / "locagen.xml"
-        ET.ElementTree(slim(sources, texts=texts)).write(xml, encoding="utf-8")
+        ET.ElementTree(root).write(xml, encoding="utf-8")
         said = io.StringIO()
         with contextlib.redirect_stdout(said):
             done = mavgen.mavgen(mavgen.Opts(str(output), "2.0", language, validate=False), [str(xml)])
         if not done or not output.exists():
             raise SystemExit(f"mavgen failed:\n{said.getvalue()}")
+
+
+def tables() -> str:
+    """Our messages and enums as Markdown, with the place of every field in the payload."""
+    from pymavlink.generator.mavparse import MAVXML
+
+    definition = MAVXML(str(OWN_XML), "2.0")
+    lines = []
+    for message in definition.message:
+        lines += ["", f"### {message.name} ({message.id})", "", message.description, ""]
+        lines += [f"{message.wire_length} bytes, CRC extra {message.crc_extra}, little-endian.", ""]
+        lines += ["| byte | field | type | unit | not known | |", "| --- | --- | --- | --- | --- | --- |"]
+        for field in message.ordered_fields:
+            kind = field.type + (f"[{field.array_length}]" if field.array_length else "")
+            unit, invalid = field.units.strip("[]"), field.invalid.strip("[]")
+            cells = (field.wire_offset, f"`{field.name}`", kind, unit, invalid, field.description)
+            lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
+    for enum in definition.enum:
+        lines += [
+            "",
+            f"### {enum.name}",
+            "",
+            enum.description,
+            "",
+            "| value | name | |",
+            "| --- | --- | --- |",
+        ]
+        for entry in enum.entry:
+            lines.append(
+                f"| {entry.value} | `{entry.name.removeprefix(enum.name + '_')}` | {entry.description} |"
+            )
+    return "\n".join([*lines, ""])
+
+
+def with_tables(text: str) -> str:
+    """The document with its tables made anew. Raises `SystemExit` where the two marks are missing."""
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not end:
+        raise SystemExit(f"the document has no {BEGIN} and {END}")
+    return f"{before}{begin}\n{tables()}\n{end}{after}"
 
 
 def fresh() -> bool:
@@ -182,12 +235,19 @@ def fresh() -> bool:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Makes the MAVLink messages of locagen-edge.")
     parser.add_argument("--lua", type=Path, metavar="FILE", help="write a Wireshark dissector instead")
+    parser.add_argument(
+        "--docs", type=Path, metavar="FILE", help="renew the tables in a Markdown file instead"
+    )
     arguments = parser.parse_args()
-    if arguments.lua:
-        generate(arguments.lua, "WLua", texts=True)
+    if arguments.docs:
+        text = with_tables(arguments.docs.read_text(encoding="utf-8"))
+        with _in_place(arguments.docs) as output:
+            output.write_text(text, encoding="utf-8")
+    elif arguments.lua:
+        generate(arguments.lua, "WLua")
     else:
         generate()
-    print(f"written: {arguments.lua or MODULE}", file=sys.stderr)
+    print(f"written: {arguments.docs or arguments.lua or MODULE}", file=sys.stderr)
 
 
 if __name__ == "__main__":
