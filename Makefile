@@ -102,6 +102,7 @@ csrc-test-aarch64: ## the same for aarch64 under qemu-user
 .PHONY: nightly
 nightly: $(VENV)/.dev csrc-test csrc-test-aarch64 ## the tests with many more and new examples
 	LOCAGEN_NIGHTLY=1 $(BIN)/python -m pytest
+	PYTHONPATH=. $(BIN)/python tests/mavlink/fuzz.py --inputs 10000000
 
 .PHONY: bench
 bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
@@ -109,6 +110,7 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(BIN)/python bench/bench_kernel.py
 	$(BIN)/python bench/bench_steered.py
 	$(BIN)/python bench/bench_pipeline.py
+	$(BIN)/python bench/bench_framer.py
 	$(BIN)/python bench/bench_accuracy.py --trials 100
 	$(BIN)/python bench/bench_twin.py
 

@@ -11,8 +11,9 @@ Only `Sender` makes frames, and only of what `SENT` names. Some ids act on fligh
 from __future__ import annotations
 
 import binascii
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Any
 
@@ -94,9 +95,44 @@ def checksum(data: bytes, crc_extra: int) -> int:
     return _Crc(data + bytes((crc_extra,))).crc
 
 
+def _picker(kind: Any) -> tuple[Callable[[tuple[Any, ...]], tuple[Any, ...]], tuple[int, ...]]:
+    """What takes the constructor's arguments out of an unpacked payload, and which of them are texts."""
+    places: list[int | slice] = []
+    for order in kind.orders:
+        first, count = sum(kind.lengths[:order]), kind.lengths[order]
+        places.append(first if count == 1 else slice(first, first + count))
+    texts = tuple(at for at, name in enumerate(kind.fieldtypes) if name == "char")
+    pick = itemgetter(*places)
+    return (pick if len(places) > 1 else lambda values: (pick(values),)), texts
+
+
+_PICKERS = {id: _picker(kind) for id, kind in messages.mavlink_map.items()}
+
+
 def decode(raw: bytes) -> Any:
-    """The generated message of a whole frame whose checksum has been verified (`framer.Packet.raw`)."""
-    return messages.MAVLink(None).decode(bytearray(raw))
+    """The generated message of a whole frame whose checksum has been verified (`framer.Packet.raw`).
+
+    The generated `MAVLink.decode` does the same in twice the time: it verifies again, and sorts fields anew.
+    """
+    if raw[0] == 0xFD:
+        payload, incompatible, compatible, sequence, system_id, component_id = raw[1:7]
+        id, start = int.from_bytes(raw[7:10], "little"), 10
+    else:
+        payload, sequence, system_id, component_id, id = raw[1:6]
+        incompatible, compatible, start = 0, 0, 6
+    kind = messages.mavlink_map[id]
+    size = kind.unpacker.size
+    pick, texts = _PICKERS[id]
+    # zeros at the end may have been cut, and a newer sender's fields come behind the ones known here
+    fields = pick(kind.unpacker.unpack(raw[start : start + min(payload, size)].ljust(size, b"\0")))
+    if texts:
+        fields = tuple(field.rstrip(b"\0") if at in texts else field for at, field in enumerate(fields))
+    message = kind(*fields)
+    message._msgbuf = bytearray(raw)
+    message._header = messages.MAVLink_header(
+        id, incompatible, compatible, payload, sequence, system_id, component_id
+    )
+    return message
 
 
 def heartbeat(state: int) -> Any:
