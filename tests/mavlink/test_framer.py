@@ -192,7 +192,7 @@ def test_counters_add_up() -> None:
 
 
 def test_damaged_frames_by_the_thousand_neither_raise_nor_pile_up() -> None:
-    """A short run of what the night runs by the ten million; in a process of its own, whose size is measured."""
+    """A short run of what the night runs by the ten million, in a process whose size is measured."""
     script = Path(__file__).parent / "fuzz.py"
     done = subprocess.run(
         [sys.executable, str(script), "--inputs", "60000", "--seed", "1"],
