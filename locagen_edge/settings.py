@@ -317,6 +317,20 @@ class MavlinkSettings:
     rate_hz: float = setting(
         2.0, "How often a bearing is sent while something calls.", unit="Hz", least=0.1, most=20
     )
+    signing_key: str = setting(
+        "",
+        "A file with the key for MAVLink 2 signing, which only its owner may read (chmod 600): 64 "
+        "hexadecimal digits, or the passphrase that was given to the ground station. Empty: nothing is "
+        "signed. With a key, what comes unsigned or wrongly signed is not obeyed.",
+    )
+    signing_link_id: int = setting(
+        0, "Link id in signatures of the first link; the others count on from it.", least=0, most=255
+    )
+    signing_state: str = setting(
+        "",
+        "Folder where the last timestamp is kept over restarts; empty: the service's state directory, "
+        "/var/lib/locagen-edge under systemd, else ~/.local/state/locagen-edge.",
+    )
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from typing import Any
 from locagen_edge.geometry import compass_deg
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.framer import Framer, Packet
+from locagen_edge.mavlink.signing import Guard
 from locagen_edge.settings import MavlinkSettings
 from locagen_edge.types import Track
 
@@ -72,7 +73,9 @@ class Component:
     the computer's boot, which is what the field is called.
     """
 
-    def __init__(self, settings: MavlinkSettings, start_s: float = 0.0) -> None:
+    def __init__(self, settings: MavlinkSettings, start_s: float = 0.0, guard: Guard | None = None) -> None:
+        self.guard = guard or Guard()
+        """who may speak to us"""
         self._fixed_id = settings.system_id
         self._start_s = start_s
         self._framer = Framer()
@@ -106,6 +109,8 @@ class Component:
     def receive(self, data: bytes, now_s: float) -> None:
         """Takes bytes from the link. Never raises on what they hold."""
         for packet in self._framer.feed(data):
+            if not self.guard.admit(packet, now_s):
+                continue
             if packet.message_id == dialect.HEARTBEAT and _is_autopilot(packet):
                 self._hear_autopilot(packet.system_id, now_s)
 
@@ -121,7 +126,7 @@ class Component:
 
     def due(self, now_s: float, status: Status) -> list[bytes]:
         """The frames to send now. Call it several times as often as `rate_hz`, at least 10 times a second."""
-        self._follow_faults(now_s, status.faults)
+        self._follow_faults(now_s, (*status.faults, *self.guard.complaints(now_s)))
         if status.hearing:
             self._follow_call(status)
         return [self._pack(name, message) for name, message in self._messages(now_s, status)]
