@@ -160,7 +160,7 @@ def test_a_failing_source_is_reopened_and_told_while_the_link_goes_on(ground):
             await until(lambda: daemon.source_fault)
             await until(lambda: not daemon.hearing)
             before = daemon.component.sent["HEARTBEAT"]
-            assert daemon.link.up
+            assert daemon.links.up
             await until(lambda: daemon.counters.source_failures >= 3)
             assert daemon.counters.frames >= 10
             assert daemon.component.sent["HEARTBEAT"] - before <= 3  # only in the moments when it heard
@@ -214,8 +214,8 @@ def test_a_link_that_cannot_be_opened_does_not_stop_the_sound():
 
     async def test() -> None:
         async with running(settings, sources=source(settings)) as daemon:
-            await until(lambda: daemon.counters.estimates > 20 and daemon.link.last_error)
-            assert not daemon.link.up
+            await until(lambda: daemon.counters.estimates > 20 and daemon.links.last_error)
+            assert not daemon.links.up
 
     asyncio.run(test())
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -47,6 +47,10 @@ TEXT_S = 0.5
 """least mean distance of two texts: a radio link at 57600 baud and a reader's eye both bear it"""
 TEXTS_WAITING = 8
 """texts that may wait, 4 s of them; beyond that the newest is dropped and counted"""
+ANSWERS_AT_ONCE = 10
+"""answers to a link at a time, 100 a second: a radio link carries no more"""
+ANSWERS_WAITING = 64
+"""answers that may wait for a link; beyond that the oldest goes, whoever asked will ask again"""
 
 _FIRST_SYSTEM_ID = 1  # until the autopilot is heard; every autopilot's default
 _GROUND_STATION_ID = 255
@@ -78,7 +82,9 @@ class Component:
         """who may speak to us"""
         self._fixed_id = settings.system_id
         self._start_s = start_s
-        self._framer = Framer()
+        self.received: defaultdict[int, Framer] = defaultdict(Framer)
+        """the framers by link, for their counters"""
+        self._answers: defaultdict[int, deque[bytes]] = defaultdict(lambda: deque(maxlen=ANSWERS_WAITING))
         self._sender = dialect.Sender(self._fixed_id or _FIRST_SYSTEM_ID, settings.component_id)
         self._heartbeat = _Every(HEARTBEAT_S)
         self._values = _Every(1.0 / settings.rate_hz)
@@ -99,20 +105,17 @@ class Component:
         """The id under which we send."""
         return self._sender.system_id
 
-    @property
-    def received(self) -> Framer:
-        """The framer, for its counters."""
-        return self._framer
-
     # --- in -------------------------------------------------------------------------------------------
 
-    def receive(self, data: bytes, now_s: float) -> None:
-        """Takes bytes from the link. Never raises on what they hold."""
-        for packet in self._framer.feed(data):
+    def receive(self, data: bytes, now_s: float, link: int = 0) -> None:
+        """Takes bytes from a link, by its number. Never raises on what they hold."""
+        for packet in self.received[link].feed(data):
             if not self.guard.admit(packet, now_s):
                 continue
             if packet.message_id == dialect.HEARTBEAT and _is_autopilot(packet):
                 self._hear_autopilot(packet.system_id, now_s)
+            elif packet.message_id == dialect.PING:
+                self._hear_ping(packet, link)
 
     def _hear_autopilot(self, system_id: int, now_s: float) -> None:
         if system_id != (self._fixed_id or self.system_id):
@@ -122,6 +125,13 @@ class Component:
             self._sender.system_id = system_id
         self.autopilot_heard_s = now_s
 
+    def _hear_ping(self, packet: Packet, link: int) -> None:
+        """A ping at nobody in particular asks all to answer it to its sender."""
+        message = dialect.decode(packet.raw)
+        if message.target_system == 0 and message.target_component == 0:
+            answer = dialect.ping(message, packet.system_id, packet.component_id)
+            self._answers[link].append(self._pack("PING", answer))
+
     # --- out ------------------------------------------------------------------------------------------
 
     def due(self, now_s: float, status: Status) -> list[bytes]:
@@ -130,6 +140,11 @@ class Component:
         if status.hearing:
             self._follow_call(status)
         return [self._pack(name, message) for name, message in self._messages(now_s, status)]
+
+    def answers(self, link: int) -> list[bytes]:
+        """The frames that go to this link alone, as many as may go now."""
+        waiting = self._answers[link]
+        return [waiting.popleft() for _ in range(min(len(waiting), ANSWERS_AT_ONCE))]
 
     def say_again(self) -> None:
         """The link has come up: tell again what holds now, to whoever is there now."""

@@ -31,10 +31,11 @@ HEARTBEAT: int = messages.MAVLINK_MSG_ID_HEARTBEAT
 NAMED_VALUE_FLOAT: int = messages.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT
 STATUSTEXT: int = messages.MAVLINK_MSG_ID_STATUSTEXT
 TUNNEL: int = messages.MAVLINK_MSG_ID_TUNNEL
+PING: int = messages.MAVLINK_MSG_ID_PING
 LOCAGEN_BEARING: int = messages.MAVLINK_MSG_ID_LOCAGEN_BEARING
 LOCAGEN_POSITION: int = messages.MAVLINK_MSG_ID_LOCAGEN_POSITION
 
-SENT = frozenset({HEARTBEAT, NAMED_VALUE_FLOAT, STATUSTEXT, TUNNEL, LOCAGEN_BEARING, LOCAGEN_POSITION})
+SENT = frozenset({HEARTBEAT, NAMED_VALUE_FLOAT, STATUSTEXT, TUNNEL, PING, LOCAGEN_BEARING, LOCAGEN_POSITION})
 """ids that may leave"""
 
 STATE_ACTIVE: int = messages.MAV_STATE_ACTIVE
@@ -156,6 +157,11 @@ def statustext(severity: int, text: str) -> Any:
     """STATUSTEXT in printable ASCII, cut at 50 bytes: what else the text holds becomes a question mark."""
     plain = "".join(c if " " <= c <= "~" else "?" for c in text[:TEXT_BYTES])
     return messages.MAVLink_statustext_message(severity, plain.encode("ascii"))
+
+
+def ping(asked: Any, system_id: int, component_id: int) -> Any:
+    """PING, as the answer to one from that component."""
+    return messages.MAVLink_ping_message(asked.time_usec, asked.seq, system_id, component_id)
 
 
 _TUNNEL_BYTES = 128

@@ -129,7 +129,7 @@ def fuzz(inputs: int, seed: int) -> int:
         component.receive(data, done * 1e-3)
         if done % TICK == 0:
             assert fed == found + framer.skipped + framer.waiting
-            assert component.received.frames == framer.frames
+            assert component.received[0].frames == framer.frames
             for frame in component.due(done * 1e-3, status):
                 assert len(frame) <= LONGEST
         if done == min(WARM, inputs // 2):
