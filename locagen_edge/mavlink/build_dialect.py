@@ -180,8 +180,24 @@ def generate(path: Path = MODULE, language: str = "Python3") -> None:
         said = io.StringIO()
         with contextlib.redirect_stdout(said):
             done = mavgen.mavgen(mavgen.Opts(str(output), "2.0", language, validate=False), [str(xml)])
+            rest = f"\n# id: (crc_extra, longest payload)\nothers = {others()}\n"
         if not done or not output.exists():
             raise SystemExit(f"mavgen failed:\n{said.getvalue()}")
+        if language == "Python3":
+            with output.open("a", encoding="utf-8") as file:
+                file.write(rest)
+
+
+def others() -> dict[int, tuple[int, int]]:
+    """Seed and size of every message that MAVLink knows, to tell what is not for us from noise."""
+    from pymavlink.generator.mavparse import MAVXML
+
+    found = {}
+    for path in with_includes(definitions() / "all.xml"):
+        definition = MAVXML(str(path), "2.0")
+        for id, seed in definition.message_crcs.items():
+            found[id] = (seed, definition.message_lengths[id])
+    return dict(sorted(found.items()))
 
 
 def tables() -> str:

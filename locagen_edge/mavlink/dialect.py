@@ -67,6 +67,11 @@ LAYOUTS: Mapping[int, Layout] = MappingProxyType(
 )
 
 
+OTHERS: Mapping[int, Layout] = MappingProxyType(
+    {id: Layout(seed, size) for id, (seed, size) in messages.others.items() if id not in LAYOUTS}
+)
+"""messages that are nothing to us, from all of MAVLink's definitions: a framer passes over them whole"""
+
 _MIRROR = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 
 
