@@ -114,6 +114,8 @@ class Component:
                 continue
             if packet.message_id == dialect.HEARTBEAT and _is_autopilot(packet):
                 self._hear_autopilot(packet.system_id, now_s)
+            elif packet.message_id == dialect.COMMAND_ACK:
+                self._hear_answer(packet)
             elif packet.message_id == dialect.PING:
                 self._hear_ping(packet, link)
 
@@ -124,6 +126,12 @@ class Component:
                 return  # another vehicle on the same network
             self._sender.system_id = system_id
         self.autopilot_heard_s = now_s
+
+    def _hear_answer(self, packet: Packet) -> None:
+        """The autopilot answers; older firmware names no target."""
+        message = dialect.decode(packet.raw)
+        if packet.system_id == self.system_id and message.target_component in (0, self._sender.component_id):
+            self.guard.answered()
 
     def _hear_ping(self, packet: Packet, link: int) -> None:
         """A ping at nobody in particular asks all to answer it to its sender."""
@@ -139,7 +147,12 @@ class Component:
         self._follow_faults(now_s, (*status.faults, *self.guard.complaints(now_s)))
         if status.hearing:
             self._follow_call(status)
-        return [self._pack(name, message) for name, message in self._messages(now_s, status)]
+        frames = []
+        for name, message in self._messages(now_s, status):
+            frames.append(self._pack(name, message))
+            if name == "COMMAND_LONG":
+                self.guard.asked(now_s)
+        return frames
 
     def answers(self, link: int) -> list[bytes]:
         """The frames that go to this link alone, as many as may go now."""

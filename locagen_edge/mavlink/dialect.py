@@ -29,6 +29,7 @@ messages: Any = _messages
 
 HEARTBEAT: int = messages.MAVLINK_MSG_ID_HEARTBEAT
 NAMED_VALUE_FLOAT: int = messages.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT
+COMMAND_ACK: int = messages.MAVLINK_MSG_ID_COMMAND_ACK
 STATUSTEXT: int = messages.MAVLINK_MSG_ID_STATUSTEXT
 TUNNEL: int = messages.MAVLINK_MSG_ID_TUNNEL
 PING: int = messages.MAVLINK_MSG_ID_PING
@@ -205,6 +206,10 @@ class Sender:
 
     def __init__(self, system_id: int, component_id: int) -> None:
         self._mav = messages.MAVLink(None, system_id, component_id)
+
+    @property
+    def component_id(self) -> int:
+        return int(self._mav.srcComponent)
 
     @property
     def system_id(self) -> int:

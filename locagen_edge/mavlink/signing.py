@@ -43,6 +43,9 @@ RESTART = 1 * UNITS_PER_S
 """added to what was saved, and the time since, where only the program has started anew"""
 NEW_STREAM = 60 * UNITS_PER_S
 """how far a stream that is new may be behind us"""
+ASKED = 3
+"""questions without any answer, over `UNANSWERED_S`, before that is told: a slow link loses some"""
+UNANSWERED_S = 10.0
 STREAMS = 64
 """most streams remembered: more than a swarm has"""
 SILENCE_S = 5.0
@@ -55,6 +58,7 @@ COMPLAINTS = {
     "unsigned": "Signing mismatch? Only unsigned messages arrive",
     "wrong": "Signing mismatch? Messages have wrong signatures",
     "replayed": "Signing mismatch? Messages are older than ours",
+    "unanswered": "Signing mismatch? The autopilot never answers us",
     "no key": "Signing mismatch? Autopilot signs, we have no key",
 }
 """at most 50 characters: a STATUSTEXT"""
@@ -82,6 +86,8 @@ class Guard:
         self._streams: dict[tuple[int, int, int], int] = {}
         self._refused_s: float | None = None
         self._complaint = ""
+        self._asked = 0
+        self._asked_s = 0.0
         self.counts: Counter[str] = Counter()
         """frames by what became of them: admitted, unsigned, wrong, replayed"""
 
@@ -118,11 +124,24 @@ class Guard:
             self._complaint, self._refused_s = verdict, now_s
         return verdict == "admitted"
 
+    def asked(self, now_s: float) -> None:
+        """Something was asked of the autopilot that it would answer."""
+        if self._asked == 0:
+            self._asked_s = now_s
+        self._asked += 1
+
+    def answered(self) -> None:
+        """It has answered: it obeys us."""
+        self._asked = 0
+
     def complaints(self, now_s: float) -> tuple[str, ...]:
         """What an operator should know, in the words of `COMPLAINTS`; nothing where all is well."""
-        if self._key is not None and (self._refused_s is None or now_s - self._refused_s < SILENCE_S):
-            return ()
-        return (COMPLAINTS[self._complaint],) if self._complaint else ()
+        late = self._refused_s is not None and now_s - self._refused_s >= SILENCE_S
+        if self._complaint and (late or self._key is None):
+            return (COMPLAINTS[self._complaint],)
+        if self._asked >= ASKED and now_s - self._asked_s >= UNANSWERED_S:
+            return (COMPLAINTS["unanswered"],)
+        return ()
 
     def _verdict(self, packet: Packet) -> str:
         if self._key is None:

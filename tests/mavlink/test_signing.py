@@ -307,3 +307,17 @@ def test_the_component_obeys_only_its_own_kind_and_says_why():
     assert [m.text for m in texts if m.get_type() == "STATUSTEXT"] == [COMPLAINTS["unsigned"]]
     component.receive(peer.heartbeat(), 11.0)
     assert component.system_id == 7
+
+
+@pytest.mark.parametrize("key", [None, KEY])
+def test_an_autopilot_that_never_answers_is_told_until_it_does(key):
+    """What it does with messages that it does not trust: nothing, without a word."""
+    component, peer = Component(MavlinkSettings(system_id=7), guard=guard(key)), Peer(key)
+    we = component.guard
+    for second in range(signing.ASKED):
+        assert we.complaints(100.0) == ()
+        we.asked(second)
+    assert we.complaints(signing.UNANSWERED_S - 0.1) == ()
+    assert we.complaints(signing.UNANSWERED_S) == (COMPLAINTS["unanswered"],)
+    component.receive(bytes(common.MAVLink_command_ack_message(511, 0).pack(peer.mav)), 100.0)
+    assert we.complaints(200.0) == ()
