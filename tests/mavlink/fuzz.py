@@ -20,8 +20,10 @@ from pymavlink.dialects.v20 import common
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.framer import LONGEST, Framer
+from locagen_edge.mavlink.signing import Guard
 from locagen_edge.settings import MavlinkSettings
 
+KEY = b"k" * 32
 GROWTH_KIB = 4096
 """what the process may grow by once it is warm: an allocator's scatter, far below a byte per input"""
 WARM = 20_000
@@ -33,7 +35,7 @@ TICK = 1000
 def seeds() -> list[bytes]:
     """One frame of every message that we know, as MAVLink 2, 1 where that exists, and signed."""
     plain, signed = common.MAVLink(None, 1, 1), common.MAVLink(None, 1, 1)
-    signed.signing.secret_key = b"k" * 32
+    signed.signing.secret_key = KEY
     signed.signing.sign_outgoing = True
     made = []
     for id, layout in dialect.LAYOUTS.items():
@@ -115,6 +117,7 @@ def fuzz(inputs: int, seed: int) -> int:
     rng = random.Random(seed)
     corpus = seeds()
     framer, component = Framer(), Component(MavlinkSettings())
+    guarded = Component(MavlinkSettings(), guard=Guard(KEY, clock=lambda: 0))
     status = Status(hearing=True, track=None, snr_db=0.0, faults=())
     fed = found = grown_from = 0
     for done in range(1, inputs + 1):
@@ -127,15 +130,18 @@ def fuzz(inputs: int, seed: int) -> int:
                 dialect.untunnel(message)
         assert framer.waiting < LONGEST
         component.receive(data, done * 1e-3)
+        guarded.receive(data, done * 1e-3)
         if done % TICK == 0:
             assert fed == found + framer.skipped + framer.waiting
-            assert component.received[0].frames == framer.frames
-            for frame in component.due(done * 1e-3, status):
-                assert len(frame) <= LONGEST
+            assert component.received[0].frames == guarded.received[0].frames == framer.frames
+            for speaker in (component, guarded):
+                for frame in (*speaker.due(done * 1e-3, status), *speaker.answers(0)):
+                    assert len(guarded.guard.sign(frame)) <= LONGEST
         if done == min(WARM, inputs // 2):
             grown_from = rss_kib()
     grown = rss_kib() - grown_from
     assert grown <= GROWTH_KIB, f"grew by {grown} KiB"
+    assert guarded.guard.counts["wrong"], "no signature was ever looked at"
     assert framer.frames > inputs // 10, "hardly anything got through: this tests nothing"
     return grown
 
