@@ -76,6 +76,22 @@ class ArraySettings:
         least=0,
         most=0.1,
     )
+    delays_s: tuple[float, ...] = setting(
+        (),
+        "By how much each channel of `alsa` or `wav` is late, one number per microphone; empty: all are in "
+        "step. `locagen-edge calibrate` measures it; it is taken out before anything else hears the sound.",
+        unit="s",
+        least=-0.005,
+        most=0.005,
+    )
+    gains_db: tuple[float, ...] = setting(
+        (),
+        "By how much each channel of `alsa` or `wav` is too loud, one number per microphone; empty: all are "
+        "alike. Measured and taken out in the same way.",
+        unit="dB",
+        least=-40,
+        most=40,
+    )
 
 
 @dataclass(frozen=True)
@@ -471,6 +487,10 @@ def _faults_of_array(s: Settings) -> Iterator[str]:
         return
     if not all(math.isfinite(x) for row in positions for x in row):
         return
+    for name in ("delays_s", "gains_db"):
+        values = getattr(s.array, name)
+        if values and len(values) != len(positions):
+            yield f"array.{name}: {len(values)} numbers for {len(positions)} microphones; one each, or none"
     array = MicArray(np.array(positions, dtype=np.float64))
     for (i, j), spacing in zip(array.pairs, array.spacing_m, strict=True):
         if spacing < 1e-3:
@@ -592,10 +612,13 @@ def _in_words(kind: Any) -> str:
 # --- the sample file ----------------------------------------------------------------------------------
 
 
-def sample(settings: Settings | None = None) -> str:
-    """The sample file: every section and key with its sentence, unit, range and value (or default)."""
+def sample(settings: Settings | None = None, origin: str = "What stands here are the defaults.") -> str:
+    """The sample file: every section and key with its sentence, unit, range and value (or default).
+
+    `origin`: where the values come from, in a sentence for the file's head.
+    """
     lines = [
-        "# Settings of locagen-edge. Every key may be left out; what stands here are the defaults.",
+        *_wrapped(f"Settings of locagen-edge. Every key may be left out. {origin}"),
         "# Check a changed file with: locagen-edge check --settings FILE",
     ]
     for name, section in _sections(settings or Settings()):

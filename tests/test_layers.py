@@ -32,6 +32,7 @@ def modules_after(statement: str) -> set[str]:
         "import locagen_edge.daemon",
         "import locagen_edge.cli",
         "import locagen_edge.check",
+        "import locagen_edge.calibrate",
         "import locagen_edge.stages.mic",
         "from locagen_edge.pipeline import Pipeline; from locagen_edge.settings import from_table; "
         "Pipeline(from_table({'bearing': {'estimator': 'model:tdoa-mlp'}}))",
@@ -49,7 +50,18 @@ def test_what_is_not_used_is_not_loaded():
     assert not loaded & {"onnxruntime", "sounddevice", "soundfile", "tqdm"}
 
 
-GROUND = {"types", "geometry", "errors", "settings", "kernel", "models", "framing", "resampling"}
+GROUND = {
+    "types",
+    "geometry",
+    "errors",
+    "settings",
+    "kernel",
+    "models",
+    "framing",
+    "resampling",
+    "alignment",
+    "files",
+}
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
     "stages": GROUND,
@@ -58,6 +70,8 @@ ABOVE = {
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
     "notify": set(),
+    "calibration": GROUND,
+    "calibrate": GROUND | {"stages", "calibration"},
     "check": GROUND | {"stages", "mavlink", "pipeline", "sources"},
     "daemon": GROUND | {"stages", "mavlink", "pipeline", "sources", "notify"},
 }

@@ -94,6 +94,9 @@ BAD = {
         },
         "daemon.stall_s: 0.5 s is less than two hops",
     ),
+    "delays for others": ({"array": {"delays_s": [0, 1e-5]}}, "array.delays_s: 2 numbers for 3 microphones"),
+    "gains for others": ({"array": {"gains_db": [1]}}, "array.gains_db: 1 numbers for 3 microphones"),
+    "later than can be": ({"array": {"delays_s": [0, 0, 1]}}, "array.delays_s: 1.0 s is outside"),
     "upright pair": (
         {
             "array": {"positions_m": [[0, 0, 0], [0, 0, 0.1]]},
