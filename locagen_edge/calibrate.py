@@ -298,7 +298,7 @@ def report(heard: Heard, found: Calibration, settings: Settings, walk: Walk) -> 
     if walk.angles is not None:
         yield f"{yaw}, from {walk.known} known angles"
     else:
-        yield f"{yaw}, that of array.positions_m in the settings; --angles would tell it"
+        yield f"{yaw}, that of array.positions_m and mount_deg in the settings; --angles would tell it"
         if abs(found.turned_rad) > math.pi and walk.clockwise is None:
             yield f"            if you did not go {sense}, two channels are swapped: see --sense"
     yield f"distance    {_distance(walk)}"
@@ -376,7 +376,8 @@ def calibrated(settings: Settings, heard: Heard, found: Calibration) -> Settings
 
     array = replace(
         settings.array,
-        positions_m=tuple(rounded(row, 6) for row in found.positions_m),
+        positions_m=tuple(rounded(row, 6) for row in found.positions_m),  # in the vehicle's axes already
+        mount_deg=(0.0, 0.0, 0.0),
         tolerance_m=round(max(found.tolerance_m, 1e-5), 6),
         delays_s=rounded(found.delays_s, 9),
         gains_db=rounded(heard.gains_db, 3),

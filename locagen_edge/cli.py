@@ -287,8 +287,12 @@ def describe(estimate: Estimate) -> str:
         parts = [f"bearing {azimuth:5.1f}° ±{sigma:4.1f}°"]
     if truth is not None:
         parts.append(f"true {compass_deg(truth.azimuth_rad):5.1f}°")
+    if track is not None and track.earth is not None:
+        parts.append(f"from north {compass_deg(track.earth.azimuth_rad):5.1f}°")
     if track is not None and track.elevation_rad is not None:
         parts.append(f"el {math.degrees(track.elevation_rad):3.0f}°")
+    if len(estimate.tracks) > 1:
+        parts.append(f"{len(estimate.tracks)} callers")
     parts.append(f"snr {estimate.detection.snr_db:5.1f} dB {'CALL' if estimate.detection.call else '    '}")
     parts += [f"! {fault}" for fault in estimate.faults]
     return "  ".join(parts)

@@ -98,7 +98,7 @@ class Daemon:
         """Makes pipeline and links. Raises `LocagenError` where the settings cannot be flown with."""
         guard = guard_of(self.settings)
         self._save_s = time.monotonic() + SAVE_S if guard.signs else math.inf
-        self.component = Component(self.settings.mavlink, guard=guard)
+        self.component = Component(self.settings.mavlink, pose=self.settings.pose, guard=guard)
         self.links = Links(
             [parse(link) for link in self.settings.mavlink.link],
             backoff_s=self.settings.daemon.backoff_s,
@@ -201,7 +201,8 @@ class Daemon:
         frame_ns = round(self.settings.audio.frame / self.settings.audio.rate_hz * 1e9)
         while (frame := await self._queue.get()) is not None:
             self._working = True
-            self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame)
+            pose = self.component.poses.at(frame.t_ns + frame_ns // 2)
+            self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
             self._working = False
             self._heard_s = time.monotonic()
             self.counters.estimates += 1
@@ -249,7 +250,9 @@ class Daemon:
         estimate = self.estimate
         if estimate is None:
             return Status(hearing=True, track=None, snr_db=0.0, faults=())
-        return Status(True, estimate.track, estimate.detection.snr_db, estimate.faults)
+        return Status(
+            True, estimate.track, estimate.detection.snr_db, estimate.faults, others=estimate.tracks[1:]
+        )
 
     async def _tick(self) -> None:
         """What is due without a new estimate; once a second the status and the watchdog."""

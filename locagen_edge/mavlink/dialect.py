@@ -29,6 +29,7 @@ messages: Any = _messages
 
 HEARTBEAT: int = messages.MAVLINK_MSG_ID_HEARTBEAT
 NAMED_VALUE_FLOAT: int = messages.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT
+COMMAND_LONG: int = messages.MAVLINK_MSG_ID_COMMAND_LONG
 COMMAND_ACK: int = messages.MAVLINK_MSG_ID_COMMAND_ACK
 STATUSTEXT: int = messages.MAVLINK_MSG_ID_STATUSTEXT
 TUNNEL: int = messages.MAVLINK_MSG_ID_TUNNEL
@@ -36,8 +37,21 @@ PING: int = messages.MAVLINK_MSG_ID_PING
 LOCAGEN_BEARING: int = messages.MAVLINK_MSG_ID_LOCAGEN_BEARING
 LOCAGEN_POSITION: int = messages.MAVLINK_MSG_ID_LOCAGEN_POSITION
 
-SENT = frozenset({HEARTBEAT, NAMED_VALUE_FLOAT, STATUSTEXT, TUNNEL, PING, LOCAGEN_BEARING, LOCAGEN_POSITION})
+SENT = frozenset(
+    {
+        HEARTBEAT,
+        NAMED_VALUE_FLOAT,
+        STATUSTEXT,
+        TUNNEL,
+        PING,
+        COMMAND_LONG,
+        LOCAGEN_BEARING,
+        LOCAGEN_POSITION,
+    }
+)
 """ids that may leave"""
+COMMANDS = frozenset({messages.MAV_CMD_SET_MESSAGE_INTERVAL})
+"""and the commands: an autopilot obeys mode, arming and position from an onboard computer too"""
 
 STATE_ACTIVE: int = messages.MAV_STATE_ACTIVE
 STATE_CRITICAL: int = messages.MAV_STATE_CRITICAL
@@ -201,6 +215,23 @@ def untunnel(message: Any) -> Any | None:
     return decode(frame + checksum(frame[1:], kind.crc_extra).to_bytes(2, "little"))
 
 
+def set_message_interval(system_id: int, message_id: int, interval_us: int) -> Any:
+    """The command to an autopilot to send us a message this often: the only command that we give."""
+    return messages.MAVLink_command_long_message(
+        target_system=system_id,
+        target_component=COMPONENT_AUTOPILOT,
+        command=messages.MAV_CMD_SET_MESSAGE_INTERVAL,
+        confirmation=0,
+        param1=float(message_id),
+        param2=float(interval_us),
+        param3=0.0,
+        param4=0.0,
+        param5=0.0,
+        param6=0.0,
+        param7=0.0,  # to whom: as the autopilot does by itself, on the link on which it was asked
+    )
+
+
 class Sender:
     """Packs messages as MAVLink 2 under our ids, and numbers them."""
 
@@ -222,10 +253,12 @@ class Sender:
     def pack(self, message: Any) -> bytes:
         """The frame; the next one gets the next sequence number.
 
-        Raises `ValueError` for what is not in `SENT`.
+        Raises `ValueError` for what is not in `SENT`, or a command not in `COMMANDS`.
         """
         if message.get_msgId() not in SENT:
             raise ValueError(f"{message.get_type()} is none of the messages that may leave")
+        if message.get_msgId() == COMMAND_LONG and message.command not in COMMANDS:
+            raise ValueError(f"command {message.command} is none of those that may leave")
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame

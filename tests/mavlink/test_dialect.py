@@ -235,6 +235,9 @@ def test_only_what_may_leave_leaves():
     sender = dialect.Sender(1, 191)
     with pytest.raises(ValueError, match="DISTANCE_SENSOR"):
         sender.pack(dialect.messages.MAVLink_distance_sensor_message(0, 1, 2, 1, 0, 0, 0, 0))
+    arm = common.MAV_CMD_COMPONENT_ARM_DISARM
+    with pytest.raises(ValueError, match="command 400 "):
+        sender.pack(dialect.messages.MAVLink_command_long_message(1, 1, arm, 0, 1, 0, 0, 0, 0, 0, 0))
 
 
 @given(st.binary(max_size=300), st.integers(0, 255))
