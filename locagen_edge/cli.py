@@ -38,7 +38,7 @@ from locagen_edge.types import Estimate, Frame
 if TYPE_CHECKING:
     from locagen_edge.daemon import Daemon
     from locagen_edge.jsonl import Record
-    from locagen_edge.mavlink.link import Link
+    from locagen_edge.mavlink.links import Links
     from locagen_edge.store.recorder import Progress, Recorder
 
 SERVICE_STATE = Path("/var/lib/locagen-edge")
@@ -330,9 +330,10 @@ async def _serve(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, daemon.stop)
     if not quiet:
+        links = ", ".join(settings.mavlink.link)
         print(
             f"locagen-edge {__version__}: {settings.audio.source} source, "
-            f"{settings.bearing.estimator} estimator, MAVLink to {settings.mavlink.link}; Ctrl-C ends",
+            f"{settings.bearing.estimator} estimator, MAVLink to {links}; Ctrl-C ends",
             flush=True,
         )
     await daemon.startup()
@@ -349,7 +350,7 @@ async def _serve(
         print(
             f"{c.estimates} frames, {c.dropped} dropped, {c.overruns} overruns, "
             f"{c.source_failures} source failures; sent {_counts(daemon.component.sent)}, "
-            f"{daemon.link.dropped} of them lost"
+            f"{daemon.links.dropped} of them lost"
         )
 
 
@@ -373,17 +374,18 @@ class LiveLine:
             parts.append(describe(daemon.estimate))
             if latency:
                 parts.append(f"{1e3 * statistics.median(latency):.1f} ms")
-        parts.append(self._link(daemon.link, news))
+        parts.append(self._links(daemon.links, news))
         print("  ".join(parts), flush=True)
 
-    def _link(self, link: Link, news: Counter[str]) -> str:
+    def _links(self, links: Links, news: Counter[str]) -> str:
         """What was sent in the last second, and what became of it."""
-        dropped, self._dropped = link.dropped - self._dropped, link.dropped
-        refused, self._refused = link.refused - self._refused, link.refused
-        if not link.up:
-            return f"link down: {link.last_error or 'nobody heard yet'}"
+        dropped, self._dropped = links.dropped - self._dropped, links.dropped
+        refused, self._refused = links.refused - self._refused, links.refused
+        if not links.up:
+            return f"link down: {links.last_error or 'nobody heard yet'}"
         lost = f", {dropped} lost" if dropped else ""
-        return f"sent {_counts(news)}{lost}{' (nobody listens)' if refused else ''}"
+        down = f"; down: {links.last_error}" if links.last_error else ""
+        return f"sent {_counts(news)}{lost}{' (nobody listens)' if refused else ''}{down}"
 
 
 def describe(estimate: Estimate) -> str:

@@ -22,9 +22,11 @@ from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from locagen_edge.errors import SourceError, SourceHungError
+from locagen_edge.errors import LinkError, SourceError, SourceHungError
 from locagen_edge.mavlink.component import Component, Status, is_confirmed
-from locagen_edge.mavlink.link import Link, parse
+from locagen_edge.mavlink.link import parse
+from locagen_edge.mavlink.links import Links
+from locagen_edge.mavlink.signing import SAVE_S, guard_of, save_timestamp, state_file
 from locagen_edge.notify import notify
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings
@@ -36,6 +38,8 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.1
 """How often what is due is sent: a tenth of the heartbeat's period."""
+SAY_AGAIN_S = 10.0
+"""What holds is told again to all when one more link comes up, but no more often than this."""
 FIRST_WAIT_S = 0.5
 STOP_S = 0.9
 """All of shutdown has to end within a second: source, then queue, then the rest, with what is left of it."""
@@ -60,7 +64,7 @@ class Counters:
 
 
 class Daemon:
-    """One source, one pipeline, one link.
+    """One source, one pipeline, one component on all its links.
 
     `on_second(daemon)` is called once per second of the main loop. `sources` opens the source that the
     settings name; a test passes its own.
@@ -87,22 +91,28 @@ class Daemon:
         self._ready = False
         self._working = False
         self._told: BaseException | None = None
-        self._link_was_up = False
+        self._links_up = 0
+        self._said_s = -math.inf
+        self._save_s = math.inf
+        self._complaints: tuple[str, ...] = ()
 
     async def startup(self) -> None:
-        """Makes pipeline and link. Raises `LocagenError` where the settings cannot be flown with."""
-        self.component = Component(self.settings.mavlink, pose=self.settings.pose)
-        self.link = Link(
-            parse(self.settings.mavlink.link),
+        """Makes pipeline and links. Raises `LocagenError` where the settings cannot be flown with."""
+        guard = guard_of(self.settings)
+        self._save_s = time.monotonic() + SAVE_S if guard.signs else math.inf
+        self.component = Component(self.settings.mavlink, pose=self.settings.pose, guard=guard)
+        self.links = Links(
+            [parse(link) for link in self.settings.mavlink.link],
             backoff_s=self.settings.daemon.backoff_s,
-            on_bytes=lambda data: self.component.receive(data, time.monotonic()),
+            on_bytes=self._receive,
+            guard=guard,
         )
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="pipeline")
         # models load in the worker: the event loop stays free, and they belong to the thread that calls
         loop = asyncio.get_running_loop()
         self.pipeline = await loop.run_in_executor(self._executor, Pipeline, self.settings)
         self._tasks = [
-            asyncio.create_task(self.link.run(), name="link"),
+            asyncio.create_task(self.links.run(), name="links"),
             asyncio.create_task(self._capture(), name="capture"),
             asyncio.create_task(self._work(), name="work"),
             asyncio.create_task(self._tick(), name="tick"),
@@ -147,6 +157,8 @@ class Daemon:
             if task.done() and not task.cancelled() and (error := task.exception()) is not self._told:
                 log.error("while stopping, %s: %s", task.get_name(), error)
         self._executor.shutdown(wait=False, cancel_futures=True)
+        if self.component.guard.signs:
+            self._remember_timestamp()
         if self.black_box is not None:
             # it has written all along: only a disk that hangs takes so long
             self.black_box.close(max(start + STOP_S - time.monotonic(), 0.05))
@@ -221,14 +233,25 @@ class Daemon:
 
     def _send(self) -> None:
         """Sends what is due. While the link is down nothing is: it would be said to nobody."""
-        if not self.link.up:
-            self._link_was_up = False
-            return
-        if not self._link_was_up:
-            self._link_was_up = True
+        up, now_s = self.links.up, time.monotonic()
+        # Who has just come up has heard nothing; but one that flaps must not make all others hear it again.
+        if up > self._links_up and (not self._links_up or now_s - self._said_s > SAY_AGAIN_S):
             self.component.say_again()
-        for message in self.component.due(time.monotonic(), self._status()):
-            self.link.send(message)
+            self._said_s = now_s
+        self._links_up = up
+        if not up:
+            return
+        for message in self.component.due(now_s, self._status()):
+            self.links.send(message)
+
+    def _receive(self, number: int, data: bytes) -> None:
+        """Bytes from a link. What is asked there is answered there."""
+        self.component.receive(data, time.monotonic(), number)
+        self._answer(number)
+
+    def _answer(self, number: int) -> None:
+        for message in self.component.answers(number):
+            self.links.answer(number, message)
 
     def _status(self) -> Status:
         if not self.hearing:
@@ -247,11 +270,14 @@ class Daemon:
         while True:
             await asyncio.sleep(TICK_S)
             self._send()
+            for number in range(len(self.links.links)):
+                self._answer(number)
             if time.monotonic() < next_s:
                 continue
             next_s = max(next_s, time.monotonic() - 1.0) + 1.0  # after a suspension no second is made up for
             if self._on_second is not None:
                 self._on_second(self)
+            self._watch_signing()
             if self.hearing or self.source_fault:
                 notify(WATCHDOG="1", STATUS=self._in_words())
             else:
@@ -264,16 +290,34 @@ class Daemon:
         """What the black box keeps the changes of."""
         c = self.counters
         return {
-            "link": {"up": self.link.up, "error": "" if self.link.up else self.link.last_error},
+            "link": {"up": self.links.up == len(self.links.links), "error": self.links.last_error},
             "source": {"fault": self.source_fault},
-            "losses": {"frames": c.dropped, "overruns": c.overruns, "messages": self.link.dropped},
+            "losses": {"frames": c.dropped, "overruns": c.overruns, "messages": self.links.dropped},
         }
+
+    def _watch_signing(self) -> None:
+        """Tells the log what the other end does not: that it ignores us. Keeps the timestamp."""
+        complaints = self.component.guard.complaints(time.monotonic())
+        for complaint in set(complaints) - set(self._complaints):
+            log.warning("%s (mavlink.signing_key)", complaint)
+        self._complaints = complaints
+        if time.monotonic() >= self._save_s:
+            self._save_s = time.monotonic() + SAVE_S
+            # a disk may take its time: not on the loop that carries sound
+            asyncio.get_running_loop().run_in_executor(None, self._remember_timestamp)
+
+    def _remember_timestamp(self) -> None:
+        try:
+            save_timestamp(state_file(self.settings), self.component.guard.timestamp)
+        except LinkError as error:
+            log.error("%s", error)
 
     def _in_words(self) -> str:
         """The service manager's status line: state, and every loss since the start."""
         c = self.counters
         state = "listening" if self.hearing else f"no sound: {self.source_fault or 'waiting'}"
-        losses = f"{c.dropped} dropped, {c.overruns} overruns, {self.link.dropped} messages lost"
+        losses = f"{c.dropped} dropped, {c.overruns} overruns, {self.links.dropped} messages lost"
         if self.black_box is not None and self.black_box.lost:
             losses += f", {self.black_box.lost} log records lost"
-        return f"{state}; {c.estimates} frames, {losses}"
+        down = [f"link down: {self.links.last_error}"] if self.links.last_error else []
+        return "; ".join([state, f"{c.estimates} frames, {losses}", *down, *self._complaints])

@@ -442,11 +442,12 @@ class ModelsSettings:
 class MavlinkSettings:
     """The link to the flight controller or ground station."""
 
-    link: str = setting(
-        "udpout:127.0.0.1:14550",
-        "`udpout:HOST:PORT` sends there, `udpin:HOST:PORT` listens, `tcp:HOST:PORT` connects, "
-        "`serial:DEVICE:BAUD` opens a UART.",
-        pattern=r"(udpout|udpin|tcp):[^:\s]+:\d{1,5}|serial:\S+:\d{3,8}",
+    link: tuple[str, ...] = setting(
+        ("udpout:127.0.0.1:14550",),
+        "One link, or a list of several: `udpout:HOST:PORT` sends there, `udpin:HOST:PORT` listens, "
+        "`tcp:HOST:PORT` connects, `tcpin:HOST:PORT` lets one connect, `serial:DEVICE:BAUD` opens a UART. "
+        "What is said goes to all of them; nothing is passed on from one to another.",
+        pattern=r"(udpout|udpin|tcp|tcpin):[^:\s]+:\d{1,5}|serial:\S+:\d{3,8}",
     )
     system_id: int = setting(
         0,
@@ -459,6 +460,20 @@ class MavlinkSettings:
     )
     rate_hz: float = setting(
         2.0, "How often a bearing is sent while something calls.", unit="Hz", least=0.1, most=20
+    )
+    signing_key: str = setting(
+        "",
+        "A file with the key for MAVLink 2 signing, which only its owner may read (chmod 600): 64 "
+        "hexadecimal digits, or the passphrase that was given to the ground station. Empty: nothing is "
+        "signed. With a key, what comes unsigned or wrongly signed is not obeyed.",
+    )
+    signing_link_id: int = setting(
+        0, "Link id in signatures of the first link; the others count on from it.", least=0, most=255
+    )
+    signing_state: str = setting(
+        "",
+        "Folder where the last timestamp is kept over restarts; empty: the service's state directory, "
+        "/var/lib/locagen-edge under systemd, else ~/.local/state/locagen-edge.",
     )
 
 
@@ -478,7 +493,11 @@ class DaemonSettings:
         unit="s", least=0.2, most=10,
     )  # fmt: skip
     backoff_s: float = setting(
-        10.0, "Longest wait between two attempts to reopen a source or a link.", unit="s", least=0.1, most=600
+        10.0,
+        "Longest wait between two attempts to reopen a source; a link waits for 1.5 s at most.",
+        unit="s",
+        least=0.1,
+        most=600,
     )
 
 
@@ -715,11 +734,17 @@ def _faults_of_array(s: Settings) -> Iterator[str]:
 
 
 def _faults_of_link(s: Settings) -> Iterator[str]:
-    scheme, _, rest = s.mavlink.link.partition(":")
-    digits = rest.rpartition(":")[2]
-    what, most = ("baud rate", 10_000_000) if scheme == "serial" else ("port", 65535)
-    if digits.isdigit() and not 1 <= int(digits) <= most:
-        yield f"mavlink.link: {what} {digits} is not a number from 1 to {most}"
+    links = s.mavlink.link
+    if not 1 <= len(links) <= 8:
+        yield f"mavlink.link: {len(links)} links; 1 to 8 are possible"
+    for twice in sorted({link for link in links if links.count(link) > 1}):
+        yield f"mavlink.link: {twice!r} is there twice"
+    for link in links:
+        scheme, _, rest = link.partition(":")
+        digits = rest.rpartition(":")[2]
+        what, most = ("baud rate", 10_000_000) if scheme == "serial" else ("port", 65535)
+        if digits.isdigit() and not 1 <= int(digits) <= most:
+            yield f"mavlink.link: {what} {digits} is not a number from 1 to {most}"
 
 
 S = typing.TypeVar("S", bound=Settings)
@@ -782,9 +807,11 @@ def _section(kind: type, name: str, content: dict[str, Any], faults: list[str]) 
 def _convert(value: Any, kind: Any) -> Any:
     """TOML's value as the field's type; a whole number serves where a float is asked for."""
     if isinstance(kind, types.GenericAlias) or typing.get_origin(kind) is tuple:
+        item = typing.get_args(kind)[0]
+        if item is str and isinstance(value, str):
+            value = (value,)  # a list of one text may be written without its brackets
         if not isinstance(value, (list, tuple)):
             raise TypeError
-        item = typing.get_args(kind)[0]
         return tuple(_convert(v, item) for v in value)
     if kind is float and type(value) in (int, float):
         try:

@@ -386,8 +386,8 @@ def test_no_bearing_is_lost_while_the_link_is_down(tmp_path):
                 return spoken[-1]
 
             daemon.pipeline.process = listening
-            await until(lambda: len(spoken) > 40 and daemon.link.last_error)
-            assert not daemon.link.up
+            await until(lambda: len(spoken) > 40 and daemon.links.last_error)
+            assert not daemon.links.up
             await asyncio.sleep(1.1)  # a second of states
 
     asyncio.run(test())

@@ -344,6 +344,16 @@ def test_a_port_that_cannot_be_is_refused_in_one_line(tmp_path, link, says):
     fails(1, says, "run", "--settings", path)
 
 
+def test_a_key_that_others_may_read_is_refused_in_one_line(tmp_path):
+    key, path = tmp_path / "key", tmp_path / "s.toml"
+    key.write_text("a passphrase")
+    key.chmod(0o644)
+    path.write_text(f'[mavlink]\nsigning_key = "{key}"\n')
+    fails(1, f"chmod 600 {key}", "run", "--settings", path)
+    done = cli("check", "--seconds", "1", "--settings", path)
+    assert f"WRONG  signing: mavlink.signing_key: {key}: others may read it" in done.stdout
+
+
 def test_a_port_that_is_taken_is_told_while_the_daemon_goes_on(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))

@@ -11,7 +11,7 @@ import pytest
 from conftest import ROOT
 
 PACKAGE = ROOT / "locagen_edge"
-HEAVY = {"torch", "sklearn", "scipy", "matplotlib", "pandas", "onnx", "skl2onnx", "pymavlink.mavutil"}
+HEAVY = {"torch", "sklearn", "scipy", "matplotlib", "pandas", "onnx", "skl2onnx", "pymavlink"}
 
 
 def modules_after(statement: str) -> set[str]:

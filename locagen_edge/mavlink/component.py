@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -33,6 +33,7 @@ from locagen_edge.geometry import compass_deg
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.framer import Framer, Packet
 from locagen_edge.mavlink.pose import READ, PoseHistory
+from locagen_edge.mavlink.signing import Guard
 from locagen_edge.mavlink.streams import Streams
 from locagen_edge.settings import MavlinkSettings, PoseSettings
 from locagen_edge.types import Track
@@ -52,6 +53,10 @@ CALLS_REMEMBERED = 16
 """tracks of which the operator was told; more than can be followed at a time"""
 TEXTS_WAITING = 8
 """texts that may wait, 4 s of them; beyond that the newest is dropped and counted"""
+ANSWERS_AT_ONCE = 10
+"""answers to a link at a time, 100 a second: a radio link carries no more"""
+ANSWERS_WAITING = 64
+"""answers that may wait for a link; beyond that the oldest goes, whoever asked will ask again"""
 
 _FIRST_SYSTEM_ID = 1  # until the autopilot is heard; every autopilot's default
 _GROUND_STATION_ID = 255
@@ -79,11 +84,19 @@ class Component:
     """
 
     def __init__(
-        self, settings: MavlinkSettings, start_s: float = 0.0, pose: PoseSettings | None = None
+        self,
+        settings: MavlinkSettings,
+        start_s: float = 0.0,
+        pose: PoseSettings | None = None,
+        guard: Guard | None = None,
     ) -> None:
+        self.guard = guard or Guard()
+        """who may speak to us"""
         self._fixed_id = settings.system_id
         self._start_s = start_s
-        self._framer = Framer()
+        self.received: defaultdict[int, Framer] = defaultdict(Framer)
+        """the framers by link, for their counters"""
+        self._answers: defaultdict[int, deque[bytes]] = defaultdict(lambda: deque(maxlen=ANSWERS_WAITING))
         self._sender = dialect.Sender(self._fixed_id or _FIRST_SYSTEM_ID, settings.component_id)
         self._heartbeat = _Every(HEARTBEAT_S)
         self._values = _Every(1.0 / settings.rate_hz)
@@ -107,18 +120,19 @@ class Component:
         """The id under which we send."""
         return self._sender.system_id
 
-    @property
-    def received(self) -> Framer:
-        """The framer, for its counters."""
-        return self._framer
-
     # --- in -------------------------------------------------------------------------------------------
 
-    def receive(self, data: bytes, now_s: float) -> None:
-        """Takes bytes from the link. Never raises on what they hold."""
-        for packet in self._framer.feed(data):
+    def receive(self, data: bytes, now_s: float, link: int = 0) -> None:
+        """Takes bytes from a link, by its number. Never raises on what they hold."""
+        for packet in self.received[link].feed(data):
+            if not self.guard.admit(packet, now_s):
+                continue
             if packet.message_id == dialect.HEARTBEAT and _is_autopilot(packet):
                 self._hear_autopilot(packet.system_id, now_s)
+            elif packet.message_id == dialect.COMMAND_ACK:
+                self._hear_answer(packet)
+            elif packet.message_id == dialect.PING:
+                self._hear_ping(packet, link)
             elif packet.message_id in READ:
                 self._hear_pose(packet, now_s)
 
@@ -141,14 +155,37 @@ class Component:
         if self.poses.reboots > reboots:
             self._streams.ask_all()
 
+    def _hear_answer(self, packet: Packet) -> None:
+        """The autopilot answers; older firmware names no target."""
+        message = dialect.decode(packet.raw)
+        if packet.system_id == self.system_id and message.target_component in (0, self._sender.component_id):
+            self.guard.answered()
+
+    def _hear_ping(self, packet: Packet, link: int) -> None:
+        """A ping at nobody in particular asks all to answer it to its sender."""
+        message = dialect.decode(packet.raw)
+        if message.target_system == 0 and message.target_component == 0:
+            answer = dialect.ping(message, packet.system_id, packet.component_id)
+            self._answers[link].append(self._pack("PING", answer))
+
     # --- out ------------------------------------------------------------------------------------------
 
     def due(self, now_s: float, status: Status) -> list[bytes]:
         """The frames to send now. Call it several times as often as `rate_hz`, at least 10 times a second."""
-        self._follow_faults(now_s, status.faults)
+        self._follow_faults(now_s, (*status.faults, *self.guard.complaints(now_s)))
         if status.hearing:
             self._follow_call(status)
-        return [self._pack(name, message) for name, message in self._messages(now_s, status)]
+        frames = []
+        for name, message in self._messages(now_s, status):
+            frames.append(self._pack(name, message))
+            if name == "COMMAND_LONG":
+                self.guard.asked(now_s)
+        return frames
+
+    def answers(self, link: int) -> list[bytes]:
+        """The frames that go to this link alone, as many as may go now."""
+        waiting = self._answers[link]
+        return [waiting.popleft() for _ in range(min(len(waiting), ANSWERS_AT_ONCE))]
 
     def say_again(self) -> None:
         """The link has come up: tell again what holds now, to whoever is there now."""
