@@ -321,3 +321,16 @@ def test_an_autopilot_that_never_answers_is_told_until_it_does(key):
     assert we.complaints(signing.UNANSWERED_S) == (COMPLAINTS["unanswered"],)
     component.receive(bytes(common.MAVLink_command_ack_message(511, 0).pack(peer.mav)), 100.0)
     assert we.complaints(200.0) == ()
+
+
+def test_questions_for_the_pose_that_nobody_answers_are_told_to_the_operator():
+    """An autopilot with a key that we do not have, on a port where it does not sign itself."""
+    component, peer = Component(MavlinkSettings()), Peer(None)
+    said = []
+    for tenth in range(200):
+        if tenth % 10 == 0:
+            component.receive(peer.heartbeat(), tenth / 10)
+        said += component.due(tenth / 10, QUIET)
+    assert component.sent["COMMAND_LONG"] >= signing.ASKED
+    texts = [dialect.decode(found.raw) for frame in said for found in Framer().feed(frame)]
+    assert [m.text for m in texts if m.get_type() == "STATUSTEXT"] == [COMPLAINTS["unanswered"]]
