@@ -17,6 +17,7 @@ import shutil
 import signal
 import statistics
 import sys
+import time
 from collections import Counter, deque
 from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
 from datetime import UTC, datetime
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from locagen_edge import __version__
 from locagen_edge.errors import (
     CalibrationError,
+    ExportError,
     LocagenError,
     SourceError,
     SourceHungError,
@@ -33,16 +35,20 @@ from locagen_edge.errors import (
 )
 from locagen_edge.geometry import compass_deg
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
-from locagen_edge.types import Estimate, Frame
+from locagen_edge.types import Estimate, Frame, Position, Track
 
 if TYPE_CHECKING:
     from locagen_edge.daemon import Daemon
+    from locagen_edge.export import Callers, Event
     from locagen_edge.jsonl import Record
     from locagen_edge.mavlink.links import Links
     from locagen_edge.store.recorder import Progress, Recorder
 
+EXPORT_S = 5.0
+"""How often `run --export` writes what is new."""
+EXPORT = "write callers whose place is known to a map file: .geojson, .kml or .gpx says the format"
 SERVICE_STATE = Path("/var/lib/locagen-edge")
-TYPES = ("start", "stop", "bearing", "call", "fault", "link", "source", "losses", "lost")
+TYPES = ("start", "stop", "bearing", "call", "sighting", "fault", "link", "source", "losses", "lost")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -118,6 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--seconds", type=_positive, metavar="N", help="stop after N seconds")
     run.add_argument("--quiet", action="store_true", help="no line per second (under a service manager)")
     run.add_argument("--record", type=Path, metavar="DIR", help="keep the sound too, as `record` does")
+    run.add_argument("--export", type=Path, metavar="FILE", help=EXPORT)
 
     replay = command(
         "replay",
@@ -125,7 +132,8 @@ def _parser() -> argparse.ArgumentParser:
         "run a recording through the same pipeline, faster than real time",
         "One line per hop on standard output. t_s is the time of the frame's first sample; azimuth_deg is "
         "clockwise from ahead, 0 to 360; elevation_deg is positive up; sigma_deg is the azimuth's 1-sigma; "
-        "null means that nothing can be said. The estimate is given whether or not `call` is true. A call "
+        "null means that nothing can be said. The estimate is given whether or not `call` is true; `callers` "
+        "are all that are followed. A call "
         "stands out of the background: a sound that is there from the first frame to the last is none.",
     )
     replay.add_argument(
@@ -138,6 +146,8 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument(
         "--format", choices=("jsonl", "table"), default="jsonl", help="JSON lines (default) or a table"
     )
+
+    replay.add_argument("--export", type=Path, metavar="FILE", help=EXPORT)
 
     record = command(
         "record",
@@ -179,11 +189,11 @@ def _parser() -> argparse.ArgumentParser:
         "fuse",
         _fuse,
         "find callers on the map from the sightings of one or several vehicles",
-        "Reads JSON lines, one sighting each, and prints one line per caller: place, 1-sigma ellipse, and "
-        "which vehicles saw it. With -o also a map file.",
+        "Reads the black boxes of `run`, or JSON lines of one sighting each, and prints one line per caller: "
+        "place, 1-sigma ellipse, and which vehicles saw it. With -o also a map file.",
     )
     fuse.add_argument(
-        "files", type=Path, nargs="+", metavar="FILE.jsonl", help="sightings, any number of files"
+        "files", type=Path, nargs="+", metavar="FILE", help="sightings (.jsonl), or the folder of a black box"
     )
     fuse.add_argument(
         "-o", "--output", type=Path, metavar="FILE", help="map file: .geojson, .kml or .gpx says the format"
@@ -291,29 +301,55 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 def _run(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
+    callers = None
+    if arguments.export is not None:
+        from locagen_edge.export import Callers
+
+        callers = Callers(arguments.export)
     recorder = None
     if arguments.record is not None:
         from locagen_edge.store.recorder import Recorder
 
         recorder = Recorder(arguments.record, settings)
     try:
-        asyncio.run(_serve(settings, arguments.seconds, recorder, quiet=arguments.quiet))
+        asyncio.run(_serve(settings, arguments.seconds, recorder, callers, quiet=arguments.quiet))
     finally:
         if recorder is not None:
             recorder.close()
+        if callers is not None and callers.changed:
+            _export(callers)
     return 0
 
 
 async def _serve(
-    settings: Settings, seconds: float | None, recorder: Recorder | None, *, quiet: bool
+    settings: Settings,
+    seconds: float | None,
+    recorder: Recorder | None,
+    callers: Callers | None,
+    *,
+    quiet: bool,
 ) -> None:
     from locagen_edge.daemon import Daemon
+    from locagen_edge.poses import record_of
     from locagen_edge.sources import open_source
 
+    loop = asyncio.get_running_loop()
     live = LiveLine()
     told: list[str] = []
+    export_s = 0.0
+
+    def each_estimate(frame: Frame, estimate: Estimate) -> None:
+        if recorder is not None and estimate.pose is not None:
+            recorder.note(record_of(estimate.pose))
+        if callers is not None:
+            callers.hear(estimate, _utc_ns(frame))
 
     def each_second(daemon: Daemon) -> None:
+        nonlocal export_s
+        if callers is not None and callers.changed and loop.time() >= export_s:
+            export_s = loop.time() + EXPORT_S
+            callers.changed = False
+            loop.run_in_executor(None, _export_or_tell, callers.path, callers.events)
         if not quiet:
             live(daemon)
         if recorder is not None and recorder.failure and not told:
@@ -325,8 +361,7 @@ async def _serve(
             recorder.gap(0)  # each time it is opened it begins anew
         return open_source(settings, recorder)
 
-    daemon = Daemon(settings, on_second=each_second, sources=source)
-    loop = asyncio.get_running_loop()
+    daemon = Daemon(settings, on_second=each_second, on_estimate=each_estimate, sources=source)
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, daemon.stop)
     if not quiet:
@@ -352,6 +387,30 @@ async def _serve(
             f"{c.source_failures} source failures; sent {_counts(daemon.component.sent)}, "
             f"{daemon.links.dropped} of them lost"
         )
+
+
+def _utc_ns(frame: Frame) -> int:
+    """Of the frame's first sample: as recorded, else by the clock of today."""
+    if frame.utc_ns is not None:
+        return frame.utc_ns
+    return time.time_ns() - time.monotonic_ns() + frame.t_ns
+
+
+def _export(callers: Callers) -> None:
+    from locagen_edge.export import export
+
+    export(callers.events, callers.path)
+    print(f"locagen-edge: {len(callers.events)} callers in {callers.path}", file=sys.stderr)
+
+
+def _export_or_tell(path: Path, events: list[Event]) -> None:
+    """From a thread: a disk may take its time, and one that is full is no reason to stop."""
+    from locagen_edge.export import export
+
+    try:
+        export(events, path)
+    except ExportError as error:
+        logging.error("%s", error)
 
 
 class LiveLine:
@@ -402,6 +461,9 @@ def describe(estimate: Estimate) -> str:
         parts.append(f"from north {compass_deg(track.earth.azimuth_rad):5.1f}°")
     if track is not None and track.elevation_rad is not None:
         parts.append(f"el {math.degrees(track.elevation_rad):3.0f}°")
+    place = estimate.position(track)
+    if place is not None and place.latitude_deg is not None:
+        parts.append(f"at {place.latitude_deg:.6f}, {place.longitude_deg:.6f} ±{place.semi_major_m:.0f} m")
     if len(estimate.tracks) > 1:
         parts.append(f"{len(estimate.tracks)} callers")
     parts.append(f"snr {estimate.detection.snr_db:5.1f} dB {'CALL' if estimate.detection.call else '    '}")
@@ -432,6 +494,7 @@ COLUMNS: dict[str, str] = {
     "misfit": "8.2f",
     "range_m": "8.2f",
     "estimator": "12",
+    "callers": "40",
     "faults": "",
 }
 """What one line of `replay` holds, and how the table prints it."""
@@ -453,12 +516,45 @@ def record(estimate: Estimate, t_s: float) -> dict[str, Any]:
         "misfit": round(b.misfit, 3) if math.isfinite(b.misfit) else None,
         "range_m": round(fix.range_m, 3) if fix is not None and fix.range_observable else None,
         "estimator": b.estimator,
+        "callers": [caller(track, estimate.position(track)) for track in estimate.tracks],
         "faults": list(estimate.faults),
     }
 
 
+def caller(track: Track, position: Position | None) -> dict[str, Any]:
+    """A track as plain values; the best is the first."""
+    earth = track.earth
+    shown: dict[str, Any] = {
+        "id": track.id,
+        "confirmed": track.confirmed,
+        "azimuth_deg": round(compass_deg(track.azimuth_rad), 4),
+        "sigma_deg": round(math.degrees(track.azimuth_sigma_rad), 4),
+        "from_north_deg": None if earth is None else round(compass_deg(earth.azimuth_rad), 4),
+        "latitude_deg": None,
+        "longitude_deg": None,
+        "semi_major_m": None,
+    }
+    if position is not None and position.latitude_deg is not None and position.longitude_deg is not None:
+        shown["latitude_deg"] = round(position.latitude_deg, 7)
+        shown["longitude_deg"] = round(position.longitude_deg, 7)
+        shown["semi_major_m"] = round(position.semi_major_m, 2)
+    return shown
+
+
+def _caller_in_words(c: dict[str, Any]) -> str:
+    words = f"{c['id']}: {c['azimuth_deg']:.1f}° ±{c['sigma_deg']:.1f}°"
+    if c["latitude_deg"] is not None:
+        words += f" at {c['latitude_deg']:.6f}, {c['longitude_deg']:.6f} ±{c['semi_major_m']:.0f} m"
+    return words if c["confirmed"] else f"({words})"
+
+
 def _replay(arguments: argparse.Namespace) -> int:
     files = _recordings(arguments.files)
+    callers = None
+    if arguments.export is not None:
+        from locagen_edge.export import Callers
+
+        callers = Callers(arguments.export)
     beside = files[0].with_suffix(".toml")
     if arguments.settings is None and beside.is_file():
         logging.info("settings: %s", beside)
@@ -466,9 +562,11 @@ def _replay(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
     if arguments.format == "table":
         print("  ".join(f"{name:>{_width(name)}}" for name in COLUMNS))
-    for line in replay(files, settings):
+    for line in replay(files, settings, callers):
         print(json.dumps(line) if arguments.format == "jsonl" else _row(line))
     sys.stdout.flush()
+    if callers is not None:
+        _export(callers)
     return 0
 
 
@@ -485,9 +583,9 @@ def _recordings(paths: list[Path]) -> list[Path]:
     return found
 
 
-def replay(files: list[Path], settings: Settings) -> Iterator[dict[str, Any]]:
+def replay(files: list[Path], settings: Settings, callers: Callers | None = None) -> Iterator[dict[str, Any]]:
     """The records of recordings as if they were one, hop by hop, with a progress bar where the error stream
-    is a terminal and the records go elsewhere."""
+    is a terminal and the records go elsewhere. `callers` hears them too."""
     from tqdm import tqdm
 
     from locagen_edge.pipeline import Pipeline
@@ -506,7 +604,10 @@ def replay(files: list[Path], settings: Settings) -> Iterator[dict[str, Any]]:
         for frame in wav_frames(files, settings):
             t_s = frame.start / rate_hz
             bar.update(t_s + frame_s - bar.n)
-            yield record(pipeline.process(frame), t_s)
+            estimate = pipeline.process(frame)
+            if callers is not None:
+                callers.hear(estimate, _utc_ns(frame))
+            yield record(estimate, t_s)
         bar.update(bar.total - bar.n)  # what is left is shorter than a hop
 
 
@@ -521,6 +622,8 @@ def _row(line: dict[str, Any]) -> str:
         if isinstance(value, float):
             cells.append(f"{value:{form}}")
         else:
+            if name == "callers":
+                value = [_caller_in_words(c) for c in value]
             text = "; ".join(value) if isinstance(value, list) else "-" if value is None else str(value)
             cells.append(f"{text:>{_width(name)}}")
     return "  ".join(cells)
@@ -632,8 +735,10 @@ def _fuse(arguments: argparse.Namespace) -> int:
     from locagen_edge.export import event, export
     from locagen_edge.fusion import fuse
     from locagen_edge.sightings import read
+    from locagen_edge.store.blackbox import sightings
 
-    found = fuse((look for path in arguments.files for look in read(path)), _settings(arguments).position)
+    looks = (look for p in arguments.files for look in (sightings(p) if p.is_dir() else read(p)))
+    found = fuse(looks, _settings(arguments).position)
     events = []
     for number, fused in enumerate(found, start=1):
         p = fused.position

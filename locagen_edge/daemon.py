@@ -66,7 +66,8 @@ class Counters:
 class Daemon:
     """One source, one pipeline, one component on all its links.
 
-    `on_second(daemon)` is called once per second of the main loop. `sources` opens the source that the
+    `on_second(daemon)` is called once per second of the main loop, `on_estimate(frame, estimate)` for each
+    frame; neither may wait. `sources` opens the source that the
     settings name; a test passes its own.
     """
 
@@ -75,14 +76,17 @@ class Daemon:
         settings: Settings,
         *,
         on_second: Callable[[Daemon], None] | None = None,
+        on_estimate: Callable[[Frame, Estimate], None] | None = None,
         sources: Callable[[Settings], AsyncGenerator[Frame, None]] = open_source,
     ):
         self.settings = settings
         self.counters = Counters()
         self.estimate: Estimate | None = None
+        self._middle_ns = 0  # of its frame
         self.source_fault = ""
         self.black_box: BlackBox | None = None
         self._on_second = on_second
+        self._on_estimate = on_estimate
         self._sources = sources
         self._stopping = asyncio.Event()
         self._queue: asyncio.Queue[Frame | None] = asyncio.Queue()
@@ -206,17 +210,20 @@ class Daemon:
 
     async def _work(self) -> None:
         loop = asyncio.get_running_loop()
-        frame_ns = round(self.settings.audio.frame / self.settings.audio.rate_hz * 1e9)
         while (frame := await self._queue.get()) is not None:
             self._working = True
-            pose = self.component.poses.at(frame.t_ns + frame_ns // 2)
-            self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
+            pose = frame.pose or self.component.poses.at(frame.middle_ns)
+            estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
+            self.estimate, self._middle_ns = estimate, frame.middle_ns
             self._working = False
             if self.black_box is not None:
-                self.black_box.hear(frame, self.estimate)
+                self.black_box.hear(frame, estimate)
+            if self._on_estimate is not None:
+                self._on_estimate(frame, estimate)
             self._heard_s = time.monotonic()
             self.counters.estimates += 1
-            self.counters.latency_s.append((time.monotonic_ns() - frame.t_ns - frame_ns) * 1e-9)
+            end_ns = 2 * frame.middle_ns - frame.t_ns
+            self.counters.latency_s.append((time.monotonic_ns() - end_ns) * 1e-9)
             self._send()
             self._tell_ready()
 
@@ -260,8 +267,18 @@ class Daemon:
         estimate = self.estimate
         if estimate is None:
             return Status(hearing=True, track=None, snr_db=0.0, faults=())
+        detection = estimate.detection
         return Status(
-            True, estimate.track, estimate.detection.snr_db, estimate.faults, others=estimate.tracks[1:]
+            hearing=True,
+            track=estimate.track,
+            snr_db=detection.snr_db,
+            faults=estimate.faults,
+            others=estimate.tracks[1:],
+            positions=estimate.positions,
+            t_ns=self._middle_ns,
+            noise_dbfs=detection.level_dbfs - detection.snr_db,
+            pose=estimate.pose,
+            simulated=self.settings.audio.source != "alsa",
         )
 
     async def _tick(self) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
@@ -22,7 +23,7 @@ import numpy as np
 from locagen_edge import geodesy
 from locagen_edge.errors import ExportError
 from locagen_edge.files import write
-from locagen_edge.types import Position
+from locagen_edge.types import Estimate, Position
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))
@@ -93,12 +94,51 @@ def export(events: Sequence[Event], path: Path) -> None:
 
     Raises `ExportError` where the ending is none of FORMATS or the file cannot be written.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise ExportError(f"{path}: the ending says the format: one of {', '.join(FORMATS)}")
+    _check_ending(path)
     try:
         write(path, FORMATS[path.suffix.lower()](events))
     except OSError as error:
         raise ExportError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _check_ending(path: Path) -> None:
+    if path.suffix.lower() not in FORMATS:
+        raise ExportError(f"{path}: the ending says the format: one of {', '.join(FORMATS)}")
+
+
+class Callers:
+    """The last known place of each caller of a stream, on the way into a map file.
+
+    Raises `ExportError` at once where the file could not be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        _check_ending(path)
+        if not path.parent.is_dir():
+            raise ExportError(f"{path}: there is no such folder")
+        if not os.access(path if path.exists() else path.parent, os.W_OK):
+            raise ExportError(f"{path}: may not be written")
+        self.path = path
+        self._events: dict[int, Event] = {}
+        self.changed = False
+        """since this was last set to False: whether there is something new to write"""
+
+    def hear(self, estimate: Estimate, utc_ns: int) -> None:
+        """What the pipeline made of a frame; `utc_ns` is the time of its first sample since 1970."""
+        for track in estimate.tracks:
+            position = estimate.position(track)
+            if position is None:
+                continue
+            heard_ns = utc_ns + position.t_ns - estimate.t_ns - round(position.age_s * 1e9)
+            told = event(position, heard_ns, name=f"caller {track.id}", confidence=track.confidence)
+            if told is not None:
+                self._events[track.id] = told
+                self.changed = True
+
+    @property
+    def events(self) -> list[Event]:
+        """In the order in which they were first heard."""
+        return list(self._events.values())
 
 
 # --- the ellipse --------------------------------------------------------------------------------------

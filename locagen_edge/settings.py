@@ -343,11 +343,13 @@ class PoseSettings:
     )
     compass_deg: float = setting(
         3.0,
-        "1-sigma of the true heading, magnetic declination included. It goes into azimuths from true north; "
-        "those from the nose keep the smaller sigma.",
+        "1-sigma of the true heading, magnetic declination included. It goes into azimuths from true north "
+        "(those from the nose keep the smaller sigma), and into positions: no average takes it away.",
         unit="degrees", least=0, most=90,
     )  # fmt: skip
-    tilt_deg: float = setting(1.0, "The same of roll and pitch.", unit="degrees", least=0, most=90)
+    tilt_deg: float = setting(
+        1.0, "The same of roll and pitch, mounting included.", unit="degrees", least=0, most=90
+    )
     relief_m: float = setting(
         15.0,
         "1-sigma of the ground's height against that of the take-off place. Counts where neither "
@@ -360,6 +362,11 @@ class PoseSettings:
 class PositionSettings:
     """From bearings along the flight to a place on the map."""
 
+    vehicle: str = setting(
+        "",
+        "This vehicle's name in the sightings of the log, which `fuse` joins with those of others; empty: "
+        "the computer's name, which has to be another on each vehicle.",
+    )
     range_m: tuple[float, ...] = setting(
         (2.0, 1000.0),
         "Least and greatest horizontal distance at which a caller may be; every doubling between them is as "
@@ -375,14 +382,6 @@ class PositionSettings:
         least=0,
         most=60,
     )
-    compass_deg: float = setting(
-        2.0, "1-sigma of the vehicle's heading: the same in all looks, no average takes it away.",
-        unit="degrees", least=0, most=45,
-    )  # fmt: skip
-    tilt_deg: float = setting(
-        1.0, "1-sigma of attitude and mounting about either horizontal axis.",
-        unit="degrees", least=0, most=45,
-    )  # fmt: skip
     gps_m: float = setting(
         1.5, "1-sigma of the vehicle's place, per axis; it goes into the caller's whole.",
         unit="m", least=0, most=1000,
@@ -460,6 +459,12 @@ class MavlinkSettings:
     )
     rate_hz: float = setting(
         2.0, "How often a bearing is sent while something calls.", unit="Hz", least=0.1, most=20
+    )
+    records: tuple[str, ...] = setting(
+        ("message", "tunnel"),
+        "How LOCAGEN_BEARING and LOCAGEN_POSITION (docs/mavlink.md) are sent: as `message`, inside a "
+        "`tunnel` for paths that drop messages they do not know, or both; []: not at all.",
+        pattern="message|tunnel",
     )
     signing_key: str = setting(
         "",

@@ -45,6 +45,15 @@ class Frame:
     overruns: int = 0
     """times that sound was lost between the previous frame and this one's end"""
     truth: Truth | None = None
+    pose: Pose | None = None
+    """of the vehicle at the middle, where a recording tells"""
+    utc_ns: int | None = None
+    """of the first sample, since 1970, where a recording tells"""
+
+    @property
+    def middle_ns(self) -> int:
+        """monotonic time of the middle"""
+        return self.t_ns + round(len(self.samples[0]) * 0.5e9 / self.rate_hz)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,6 +269,14 @@ class Estimate:
     """all callers, the best first"""
     pose: Pose | None = None
     """of the vehicle at the frame's middle"""
+    positions: tuple[Position, ...] = ()
+    """of those confirmed tracks whose looks told anything of a place; `caller` is the track's id"""
+    sightings: tuple[Sighting, ...] = ()
+    """the looks of this frame that went into positions"""
+
+    def position(self, track: Track | None) -> Position | None:
+        """Where the caller of this track is."""
+        return next((p for p in self.positions if track is not None and p.caller == track.id), None)
 
 
 Array = npt.NDArray[Any]

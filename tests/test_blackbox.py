@@ -53,6 +53,7 @@ def estimate(number: int, *, track: Track | None = None, call: bool = False, fau
         t_ns=number * HOP_NS,
         start=number * 512,
         track=track,
+        tracks=() if track is None else (track,),
         detection=Detection(call, 7.0, -30.0),
         faults=faults,
     )
@@ -167,20 +168,8 @@ def test_an_azimuth_is_kept_from_0_to_360_and_what_is_no_number_as_null(azimuth,
 
 
 def test_several_callers_are_told_apart_by_their_ids(tmp_path):
-    @dataclasses.dataclass(frozen=True)
-    class Identified(Track):
-        id: int = 0
-
-    @dataclasses.dataclass(frozen=True)
-    class Several(Estimate):
-        tracks: tuple[Track, ...] = ()
-
-    def values(of_what) -> dict:
-        return {f.name: getattr(of_what, f.name) for f in dataclasses.fields(of_what)}
-
     def heard(number: int, *ids: int) -> Estimate:
-        tracks = tuple(Identified(**{**values(TRACK), "id": each}) for each in ids)
-        return Several(**{**values(estimate(number)), "tracks": tracks})
+        return replace(estimate(number), tracks=tuple(replace(TRACK, id=each) for each in ids))
 
     both = [heard(n, 5, 9) for n in range(10)]
     one = [heard(n, 9) for n in range(10, 20)]
@@ -199,12 +188,12 @@ def test_every_bearing_while_something_calls_and_one_a_second_else(tmp_path):
 
 
 def test_a_call_begins_when_it_is_confirmed_and_ends_with_its_track(tmp_path):
-    def track(age_s: float, sigma: float) -> Track:
-        return replace(TRACK, age_s=age_s, azimuth_sigma_rad=sigma)
+    def track(age_s: float, sigma: float, id: int = 1) -> Track:
+        return replace(TRACK, age_s=age_s, azimuth_sigma_rad=sigma, id=id)
 
     young = [estimate(n, track=replace(track(0.05 * n, 0.1), confidence=0.2)) for n in range(10)]
     grown = [estimate(n, track=track(0.05 * n, 0.1 - 0.001 * n)) for n in range(10, 40)]
-    other = [estimate(n, track=track(0.05 * (n - 30), 0.1)) for n in range(40, 60)]
+    other = [estimate(n, track=track(0.05 * (n - 30), 0.1, id=2)) for n in range(40, 60)]
     gone = [estimate(n) for n in range(60, 70)]
     found = kept(tmp_path, young + grown + other + gone)
     begins, ends = of(found, "call", "begin"), of(found, "call", "end")

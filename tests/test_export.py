@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import math
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from locagen_edge.errors import ExportError
-from locagen_edge.export import FORMATS, SCALE_95, Event, ellipse, export, geojson, gpx, kml
+from locagen_edge.export import FORMATS, SCALE_95, Callers, Event, ellipse, export, geojson, gpx, kml
 from locagen_edge.geodesy import north_east_down_m
+from locagen_edge.types import Bearing, Detection, Estimate, Position, Tdoa, Track
 
 GPX = {"g": "http://www.topografix.com/GPX/1/1"}
 KML = {"k": "http://www.opengis.net/kml/2.2"}
@@ -108,6 +111,55 @@ def test_a_file_is_written_whole(tmp_path, ending):
     export([event()], path)
     assert path.read_text() == FORMATS[ending]([event()])
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def heard(t_ns: int, *places: tuple[int, float | None]) -> Estimate:
+    """A frame with callers, by their ids and latitudes."""
+    track = Track(1.0, 0.05, -0.3, 0.1, 0.6, 0.0, 0.9, confirmed=True)
+    positions = tuple(
+        Position(
+            t_ns + 50_000_000, id, lat is not None, lat, None if lat is None else 8.0, 400.0, np.eye(2), 1.0, 1.0,
+            0.0, 0.0, 0.1, age_s=0.2, looks=3,
+        )
+        for id, lat in places
+    )  # fmt: skip
+    tracks = tuple(replace(track, id=id) for id, _ in places)
+    silence = Bearing(None, math.pi, None, math.pi, math.inf, "none")
+    nothing = Tdoa(*[np.zeros(3)] * 3)
+    return Estimate(
+        t_ns,
+        0,
+        0,
+        nothing,
+        silence,
+        Detection(False, 0.0, -60.0),
+        None,
+        (),
+        None,
+        tracks,
+        positions=positions,
+    )
+
+
+def test_callers_keep_their_last_place_after_their_track(tmp_path):
+    callers = Callers(tmp_path / "callers.geojson")
+    callers.hear(heard(0, (1, None)), T_NS)
+    assert not callers.changed
+    callers.hear(heard(0, (1, 47.0)), T_NS)
+    callers.hear(heard(10**9, (1, 47.2), (2, 47.3), (3, None)), T_NS + 10**9)
+    callers.hear(heard(2 * 10**9), T_NS + 2 * 10**9)
+    assert callers.changed
+    assert [(e.name, e.latitude_deg) for e in callers.events] == [("caller 1", 47.2), ("caller 2", 47.3)]
+    # when it was heard: the sound's middle, less its age
+    assert callers.events[0].t_ns == T_NS + 10**9 + 50_000_000 - 200_000_000
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("callers.shp", "ending"), ("nowhere/callers.kml", "there is no such folder")]
+)
+def test_a_map_file_that_cannot_be_is_said_before_the_flight(tmp_path, name, words):
+    with pytest.raises(ExportError, match=words):
+        Callers(tmp_path / name)
 
 
 def test_what_cannot_be_written_is_said(tmp_path):

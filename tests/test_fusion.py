@@ -112,6 +112,15 @@ def test_nothing_usable_gives_nobody():
 # --- files --------------------------------------------------------------------------------------------
 
 
+def test_records_of_other_types_are_passed_over(tmp_path):
+    """Those of a black box."""
+    look = looks(two_by_two(10))[0]
+    path = tmp_path / "log-000001.jsonl"
+    told = json.dumps({"type": "sighting", "utc": "x", **json.loads(as_line(look))})
+    path.write_text('{"type": "start", "version": "1"}\n' + told + '\n{"type": "stop"}\n')
+    assert len(list(read(path))) == 1
+
+
 def test_a_line_comes_back_as_the_sighting(tmp_path):
     seen = looks(two_by_two(10))
     bare = replace(seen[0], altitude_m=None, height_m=None, elevation_rad=None)

@@ -64,6 +64,7 @@ GROUND = {
     "alignment",
     "files",
     "jsonl",
+    "poses",
 }
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
@@ -72,7 +73,7 @@ ABOVE = {
     "mavlink": GROUND,
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
-    "store": GROUND,
+    "store": GROUND | {"sightings"},
     "export": GROUND,
     "sightings": GROUND | {"export"},
     "fusion": GROUND | {"stages"},

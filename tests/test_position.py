@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from locagen_edge.geodesy import moved
 from locagen_edge.geometry import wrap
-from locagen_edge.settings import PositionSettings
+from locagen_edge.settings import PoseSettings, PositionSettings
 from locagen_edge.sim.flights import Errors, Flight, drawn, fly, line, miss_m, normalised_error, orbit
 from locagen_edge.stages.position import LOST_AFTER, Positioner, sighting
-from locagen_edge.types import Pose, Position, Sighting
+from locagen_edge.types import Pose, Position, Sighting, TrueBearing
 
 SETTINGS = PositionSettings()
+ATTITUDE = PoseSettings(compass_deg=3.0, tilt_deg=2.0)
 EXACT = Errors(1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.0, 0.0, 0.0)
 SURE = replace(SETTINGS, terrain_m=0.0, terrain_share=0.0, walk_m=0.0)
 USUAL = Errors()
@@ -366,12 +367,11 @@ def test_the_ellipse_is_that_of_the_covariance():
 def test_a_pose_makes_a_sighting():
     half = math.radians(90.0) / 2.0
     pose = Pose(7, (math.cos(half), 0.0, 0.0, math.sin(half)), 47.0, 8.0, 420.0, 20.0, 0.5)
-    look = sighting(
-        pose, SETTINGS, observer="A", caller=3, azimuth_rad=1.0, azimuth_sigma_rad=0.02,
-        elevation_rad=-0.6, elevation_sigma_rad=0.03,
-    )  # fmt: skip
+    seen = TrueBearing(1.0, 0.02, -0.6, 0.03)
+    look = sighting(pose, seen, 3, SETTINGS, ATTITUDE, tolerance_rad=0.01)
     assert look.heading_rad == pytest.approx(math.radians(90.0))
-    assert look.azimuth_bias_sigma_rad == pytest.approx(math.radians(SETTINGS.compass_deg))
+    assert look.azimuth_bias_sigma_rad == pytest.approx(math.hypot(math.radians(3.0), 0.01))
+    assert look.elevation_bias_sigma_rad == pytest.approx(math.hypot(math.radians(2.0), 0.01))
     positioner = Positioner(SETTINGS)
     assert positioner.see(look)
     position = positioner.position(3, 7)
@@ -380,5 +380,4 @@ def test_a_pose_makes_a_sighting():
     assert position.latitude_deg == pytest.approx(lat, abs=2e-5)  # 2 m: a bank's mean, not its middle
     assert position.longitude_deg == pytest.approx(lon, abs=3e-5)
     assert position.altitude_m == pytest.approx(400.0, abs=1.0)
-    lost = sighting(Pose(7, None), SETTINGS, observer="A", caller=3, azimuth_rad=1.0, azimuth_sigma_rad=0.02)
-    assert lost is None
+    assert sighting(Pose(7, None), seen, 3, SETTINGS, ATTITUDE) is None

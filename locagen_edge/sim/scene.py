@@ -202,11 +202,12 @@ class Tape:
         return np.concatenate([before, sound])
 
 
-def frames(settings: Settings, tap: Tap | None = None) -> Generator[Frame, None, None]:
-    """Frames of the scene without an end, each with its truth, as fast as taken; time counts from 0."""
+def frames(settings: Settings, tap: Tap | None = None, origin_ns: int = 0) -> Generator[Frame, None, None]:
+    """Frames of the scene without an end, each with its truth, as fast as taken; time counts from
+    `origin_ns`."""
     audio = settings.audio
     scene = Scene(settings)
-    framer = Framer(audio.frame, audio.hop, settings.mic_array.mics, audio.rate_hz)
+    framer = Framer(audio.frame, audio.hop, settings.mic_array.mics, audio.rate_hz, origin_ns)
     while True:
         block = scene.render(audio.hop)
         if tap is not None:
@@ -217,4 +218,4 @@ def frames(settings: Settings, tap: Tap | None = None) -> Generator[Frame, None,
 
 def sim(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Frame, None]:
     """The same in real time."""
-    return in_real_time(frames(settings, tap))
+    return in_real_time(lambda origin_ns: frames(settings, tap, origin_ns))

@@ -20,6 +20,7 @@ import time
 from collections.abc import AsyncGenerator, Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
@@ -31,9 +32,10 @@ from locagen_edge.alignment import Aligner
 from locagen_edge.errors import SourceError, SourceHungError
 from locagen_edge.framing import Framer, Tap, in_real_time
 from locagen_edge.jsonl import Record, read
+from locagen_edge.poses import Poses, pose_of
 from locagen_edge.resampling import Resampler
 from locagen_edge.settings import Settings
-from locagen_edge.types import Array, Frame
+from locagen_edge.types import Array, Frame, Pose
 
 log = logging.getLogger(__name__)
 
@@ -392,7 +394,8 @@ def wav_frames(paths: Path | str | Sequence[Path], settings: Settings) -> Iterat
 
     Parts of `locagen-edge record` give the frames of the day, bit for bit: the records beside them tell how
     the sound was cut, what was lost, and what the card's clock said. What does not follow on what comes
-    before begins anew: no frame holds sound from both.
+    before begins anew: no frame holds sound from both. Where the vehicle's poses were recorded too, frames
+    have them.
 
     Raises `SourceError`, naming the file, for one that is missing, empty, damaged, no audio, too slow for the
     band, too short for a frame, or without the channels that `audio.channel_map` names.
@@ -402,8 +405,8 @@ def wav_frames(paths: Path | str | Sequence[Path], settings: Settings) -> Iterat
 
 def wav(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Frame, None]:
     """The recording `audio.file` in real time, again and again if `audio.loop`. Raises like `wav_frames`."""
-    paths = [Path(settings.audio.file)]
-    return in_real_time(_wav_frames(paths, settings, loop=settings.audio.loop, tap=tap))
+    paths, loop = [Path(settings.audio.file)], settings.audio.loop
+    return in_real_time(lambda now_ns: _wav_frames(paths, settings, loop=loop, tap=tap, origin_ns=now_ns))
 
 
 def wav_duration_s(paths: Path | str | Sequence[Path], settings: Settings) -> float:
@@ -437,16 +440,19 @@ class _Piece:
     """overruns before these rows; 0: nothing was lost, but they do not follow on those before"""
     new_clock: bool
     """whether its clock has nothing to do with the one before"""
+    part: Record
+    """of the file it is from; empty: nothing was recorded beside it"""
 
 
 def _wav_frames(
-    paths: list[Path], settings: Settings, *, loop: bool, tap: Tap | None = None
+    paths: list[Path], settings: Settings, *, loop: bool, tap: Tap | None = None, origin_ns: int = 0
 ) -> Generator[Frame, None, None]:
     wav_duration_s(paths, settings)
     with _opened_wav(paths[0], settings, tell=False) as file:
         rate_hz = file.samplerate
     cutter = _Cutter(settings, rate_hz, tap)
-    time_ns = _Time(cutter.framer)
+    cutter.framer.origin_ns = origin_ns
+    day = _Day(cutter.framer, paths)
     while True:
         for piece in _pieces(paths, settings):
             if piece.rate_hz != rate_hz:
@@ -456,26 +462,49 @@ def _wav_frames(
                 )
             if piece.gap is not None:
                 if piece.gap == 0:
-                    yield from cutter.finish()
+                    yield from map(day.told, cutter.finish())
                 cutter.gap(piece.gap)
-            time_ns.follow(piece)
-            yield from cutter.push(piece.rows)
-        yield from cutter.finish()
+            day.follow(piece)
+            yield from map(day.told, cutter.push(piece.rows))
+        yield from map(day.told, cutter.finish())
         if not loop:
             return
         cutter.gap(overruns=0)  # end and beginning do not belong together, but nothing is lost
 
 
-class _Time:
-    """Recorded times, moved so that they go on from what the framer's clock says: from 0 at first."""
+class _Day:
+    """Recorded times, moved so that they go on from what the framer's clock says, and what else was recorded
+    of these times."""
 
-    def __init__(self, framer: Framer) -> None:
+    def __init__(self, framer: Framer, paths: list[Path]) -> None:
         self._framer = framer
         self._offset_ns: int | None = None
+        self._utc_ns: int | None = None  # when the recorded clock was 0
+        self._poses = Poses(())
+        # all at once: a pose comes after its sound, maybe in the next part
+        self._of_session: dict[Any, list[Pose]] = {}
+        for path in paths:
+            part, *records = _beside(path)
+            poses = self._of_session.setdefault(part.get("session"), [])
+            poses += [pose for record in records if (pose := pose_of(record)) is not None]
+
+    def told(self, frame: Frame) -> Frame:
+        """The frame with what was recorded of its time."""
+        if self._offset_ns is None:
+            return frame
+        then_ns = frame.t_ns - self._offset_ns
+        pose = self._poses.at(frame.middle_ns - self._offset_ns)
+        return replace(
+            frame,
+            pose=None if pose is None else replace(pose, t_ns=frame.middle_ns),
+            utc_ns=None if self._utc_ns is None else then_ns + self._utc_ns,
+        )
 
     def follow(self, piece: _Piece) -> None:
         if piece.new_clock:
             self._offset_ns = None
+            self._utc_ns = _utc_of_0_ns(piece.part)
+            self._poses = Poses(self._of_session[piece.part.get("session")])
         if piece.origin_ns is not None:
             if self._offset_ns is None:
                 self._offset_ns = self._framer.origin_ns - piece.origin_ns
@@ -486,7 +515,8 @@ def _pieces(paths: list[Path], settings: Settings) -> Iterator[_Piece]:
     """The files one after another, cut as they were captured where the records beside them tell."""
     ended: tuple[Any, Any] | None = None  # session and row after the last of the file before
     for path in paths:
-        part, *marks = _beside(path)
+        part, *records = _beside(path)
+        marks = [r for r in records if _is_block(r) or _is_gap(r)]
         follows = ended is not None and ended == (part.get("session"), part.get("row"))
         gap = None if ended is None or follows else 0
         new_clock = not follows
@@ -500,7 +530,7 @@ def _pieces(paths: list[Path], settings: Settings) -> Iterator[_Piece]:
                 rest = not mark  # after the last record: what has none
                 while rows := _rows(file, path, BLOCK_ROWS if rest else int(mark["rows"]), done):
                     done += len(rows[0])
-                    yield _Piece(path, rate_hz, rows[0], mark.get("origin_ns"), gap, new_clock)
+                    yield _Piece(path, rate_hz, rows[0], mark.get("origin_ns"), gap, new_clock, part)
                     gap, new_clock = None, False
                     if not rest:
                         break
@@ -508,14 +538,23 @@ def _pieces(paths: list[Path], settings: Settings) -> Iterator[_Piece]:
 
 
 def _beside(path: Path) -> list[Record]:
-    """What the recorder wrote beside a part: its record, then blocks and gaps. One empty record: nothing."""
+    """What the recorder wrote beside a part: its record, then the others. One empty record: nothing."""
     try:
         records = list(read(path.with_suffix(".blocks.jsonl")))
     except OSError:
         return [{}]
     if not records or records[0].get("type") != "part":
         return [{}]
-    return [records[0], *(r for r in records[1:] if _is_block(r) or _is_gap(r))]
+    return records
+
+
+def _utc_of_0_ns(part: Record) -> int | None:
+    """UTC since 1970 when the clock of a part was 0."""
+    try:
+        utc = datetime.fromisoformat(part["utc"])
+        return round(utc.timestamp() * 1e9) - int(part["t_ns"])
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 def _is_block(record: Record) -> bool:

@@ -29,8 +29,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from locagen_edge import geodesy
-from locagen_edge.settings import PositionSettings
-from locagen_edge.types import F64, Pose, Position, Sighting
+from locagen_edge.settings import PoseSettings, PositionSettings
+from locagen_edge.types import F64, Pose, Position, Sighting, TrueBearing
 
 SPACING = 0.3
 """Of the bank's ranges, in logarithm; each filter's 1-sigma is half of it, so that their sum is smooth."""
@@ -195,37 +195,35 @@ class Positioner:
 
 def sighting(
     pose: Pose,
-    settings: PositionSettings,
-    *,
-    observer: str,
+    look: TrueBearing,
     caller: int,
-    azimuth_rad: float,
-    azimuth_sigma_rad: float,
-    elevation_rad: float | None = None,
-    elevation_sigma_rad: float = 0.0,
+    settings: PositionSettings,
+    attitude: PoseSettings,
+    tolerance_rad: float = 0.0,
 ) -> Sighting | None:
-    """A look, its angles in earth axes, from a vehicle's pose, with the settings' lasting errors.
+    """A look, with the sigmas of its noise alone, from a vehicle's pose, with what lasts.
 
-    None where the pose knows no place.
+    That is: the errors of compass, attitude and place by the settings, and of the bearing by the places of
+    the microphones (`tolerance_rad`, 1-sigma). None where the pose knows no place.
     """
     if pose.latitude_deg is None or pose.longitude_deg is None:
         return None
     return Sighting(
         t_ns=pose.t_ns,
-        observer=observer,
+        observer=settings.vehicle,
         caller=caller,
         latitude_deg=pose.latitude_deg,
         longitude_deg=pose.longitude_deg,
         altitude_m=pose.altitude_m,
         height_m=pose.height_m,
         height_sigma_m=pose.height_sigma_m,
-        azimuth_rad=azimuth_rad,
-        azimuth_sigma_rad=azimuth_sigma_rad,
-        elevation_rad=elevation_rad,
-        elevation_sigma_rad=elevation_sigma_rad,
+        azimuth_rad=look.azimuth_rad,
+        azimuth_sigma_rad=look.azimuth_sigma_rad,
+        elevation_rad=look.elevation_rad,
+        elevation_sigma_rad=look.elevation_sigma_rad,
         heading_rad=_heading(pose),
-        azimuth_bias_sigma_rad=math.radians(settings.compass_deg),
-        elevation_bias_sigma_rad=math.radians(settings.tilt_deg),
+        azimuth_bias_sigma_rad=math.hypot(math.radians(attitude.compass_deg), tolerance_rad),
+        elevation_bias_sigma_rad=math.hypot(math.radians(attitude.tilt_deg), tolerance_rad),
         position_sigma_m=settings.gps_m,
     )
 

@@ -7,9 +7,10 @@ of small computers jump when they first learn the time, this one does not):
 - `bearing`: all of an `Estimate` by the names of its fields (`store/plain.py`: angles in degrees). Every
   one while something calls, or a track lives; one a second else;
 - `call`: `event` begin or end, `call` (counted from 1 since the start), `track` as it was then, `snr_db`,
-  `level_dbfs` and whatever of place the estimate knows (`pose`, `position`); at its end, `utc` being that of
+  `level_dbfs`, `pose` of the vehicle and `position` of the caller (or null); at its end, `utc` being that of
   the last frame with it, also `begin_utc`, `begin_t_ns`, `best` (the track when its sigma was least) and
   `snippet` (a name in the folder `calls`, or null);
+- `sighting`: a look that went into a position (`sightings.py`), which `locagen-edge fuse` reads;
 - `fault`: `event` begin or end, `text`;
 - `link`, `source`, `losses`: a state of the daemon that has changed;
 - `lost`: `records` that could not be written.
@@ -23,22 +24,26 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
+import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from locagen_edge import __version__
-from locagen_edge.errors import StorageError
+from locagen_edge.errors import ExportError, StorageError
 from locagen_edge.jsonl import Record
 from locagen_edge.settings import Settings
-from locagen_edge.store.journal import Journal
+from locagen_edge.sightings import TYPE as SIGHTING
+from locagen_edge.sightings import record_of, sighting_of
+from locagen_edge.store.journal import Journal, records
 from locagen_edge.store.plain import plain
 from locagen_edge.store.snippets import Snippets
 from locagen_edge.store.worker import Worker
-from locagen_edge.types import Estimate, Frame, Track
+from locagen_edge.types import Estimate, Frame, Sighting, Track
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +55,19 @@ QUIET_S = 1.0
 FAULT_GONE_S = 5.0
 """a fault has gone when it stayed away so long: one that flickers is one"""
 CALLS = "calls"
-NOT_OF_A_CALL = {"t_ns", "start", "overruns", "tdoa", "bearing", "detection", "track", "tracks", "faults"}
+OF_A_CALL = ("truth", "pose")
+NOT_OF_A_BEARING = ("t_ns", "sightings")
+
+
+def sightings(directory: Path) -> Iterator[Sighting]:
+    """What a black box holds for `fusion.fuse`; damaged records are passed over. Raises `StorageError`."""
+    try:
+        for record in records(directory):
+            if record.get("type") == SIGHTING:
+                with suppress(ExportError):
+                    yield sighting_of(record, str(directory))
+    except OSError as error:
+        raise StorageError(f"{error.filename or directory}: {error.strerror}") from error
 
 
 def directory_of(settings: Settings) -> Path | None:
@@ -89,6 +106,8 @@ class BlackBox:
         )
         self._snippets = Snippets(directory / CALLS, settings) if log_settings.snippets else None
         self._directory = directory
+        # numbers of callers begin anew with each start, and another start is another observer
+        self._observer = f"{settings.position.vehicle or socket.gethostname()} {_iso(time.time_ns())[:19]}Z"
         self._states: dict[str, Any] = {}
         self._lost = 0
         self._unsaid = 0  # of these, not yet told by a record
@@ -96,7 +115,7 @@ class BlackBox:
         self._snippets_told = False
         self._synced_s = 0.0
         self._quiet_ns: int | None = None
-        self._calls: dict[Any, _Call] = {}
+        self._calls: dict[int, _Call] = {}  # by track
         self._called = 0
         self._faults: dict[str, int] = {}  # and when each was last there
         self._worker: Worker[_Heard | Record] = Worker(
@@ -137,24 +156,28 @@ class BlackBox:
 
     def _hear(self, heard: _Heard) -> None:
         estimate = heard.estimate
-        tracks = _tracks(estimate)
+        tracks = {track.id: track for track in estimate.tracks}
         before = self._called
         self._follow_calls(heard, tracks)
         self._record_sound(heard, begins=self._called > before)
         self._follow_faults(heard)
         if estimate.detection.call or tracks or self._is_due(heard.frame.t_ns):
             self._quiet_ns = heard.frame.t_ns
-            self._append(_at(heard, "bearing", **plain(estimate)))
+            told = {k: v for k, v in plain(estimate).items() if k not in NOT_OF_A_BEARING}
+            self._append(_at(heard, "bearing", **told))
+        for look in estimate.sightings:
+            t_ns = look.t_ns - heard.frame.t_ns + heard.utc_ns
+            told = record_of(dataclasses.replace(look, t_ns=t_ns, observer=self._observer))
+            self._append(_at(heard, SIGHTING, **told))
 
     def _is_due(self, t_ns: int) -> bool:
         return self._quiet_ns is None or not 0 <= t_ns - self._quiet_ns < QUIET_S * 1e9
 
-    def _follow_calls(self, heard: _Heard, tracks: dict[Any, Track]) -> None:
-        for key, call in list(self._calls.items()):
-            if key not in tracks or tracks[key].age_s < call.track.age_s:  # it died, or another has its place
-                self._end_call(self._calls.pop(key))
-        for key, track in tracks.items():
-            known = self._calls.get(key)
+    def _follow_calls(self, heard: _Heard, tracks: dict[int, Track]) -> None:
+        for id in self._calls.keys() - tracks.keys():
+            self._end_call(self._calls.pop(id))
+        for id, track in tracks.items():
+            known = self._calls.get(id)
             if known is not None:
                 known.track, known.last = track, heard
                 if track.azimuth_sigma_rad < known.best.azimuth_sigma_rad:
@@ -162,7 +185,7 @@ class BlackBox:
             elif self._confirmed(track):
                 self._called += 1
                 begin = _call_record(heard, "begin", self._called, track)
-                self._calls[key] = _Call(self._called, begin, track, track, heard)
+                self._calls[id] = _Call(self._called, begin, track, track, heard)
                 self._append(begin, urgent=True)
 
     def _end_call(self, call: _Call) -> None:
@@ -246,15 +269,8 @@ class BlackBox:
             log.warning("%s: %s", self._directory, _words(error))
 
 
-def _tracks(estimate: Estimate) -> dict[Any, Track]:
-    """Tracks by what tells them apart: an id, or that there is but one."""
-    alone = () if estimate.track is None else (estimate.track,)
-    return {getattr(track, "id", 0): track for track in getattr(estimate, "tracks", ()) or alone}
-
-
 def _call_record(heard: _Heard, event: str, number: int, track: Track) -> Record:
     estimate = heard.estimate
-    place = {name: value for name, value in plain(estimate).items() if name not in NOT_OF_A_CALL}
     return _at(
         heard,
         "call",
@@ -263,7 +279,8 @@ def _call_record(heard: _Heard, event: str, number: int, track: Track) -> Record
         track=plain(track),
         snr_db=plain(estimate.detection.snr_db),
         level_dbfs=plain(estimate.detection.level_dbfs),
-        **place,
+        **{name: plain(getattr(estimate, name)) for name in OF_A_CALL},
+        position=plain(estimate.position(track)),
     )
 
 

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 
 from locagen_edge.jsonl import Record
 
+OF_A_FRAME = {"bearing", "sighting"}
 HEADER = f"{'utc':23}  {'type':8}  what"
 
 
@@ -23,10 +24,10 @@ def row(record: Record) -> str:
 
 
 def chosen(records: Iterable[Record], kinds: set[str], since: datetime | None) -> Iterator[Record]:
-    """Records of these types (none given: all but bearings), not older than `since`."""
+    """Records of these types (none given: all but those of each frame), not older than `since`."""
     for record in records:
         kind = record.get("type")
-        if (kind in kinds if kinds else kind != "bearing") and (since is None or _utc(record) >= since):
+        if (kind in kinds if kinds else kind not in OF_A_FRAME) and (since is None or _utc(record) >= since):
             yield record
 
 
@@ -59,10 +60,9 @@ def _number(value: float | None, form: str, unit: str) -> str:
 
 def _bearing(r: Record) -> str:
     detection = r["detection"]
-    tracks = r["tracks"] if "tracks" in r else [r["track"]] if r.get("track") else []
     call = "CALL" if detection["call"] else "    "
     parts = [f"{_number(r['bearing']['azimuth_deg'], '5.1f', '°'):>6}", call, _snr(detection["snr_db"])]
-    parts += [f"track {_direction(track)}" for track in tracks]
+    parts += [f"track {_direction(track)}" for track in r["tracks"]]
     return "  ".join(parts + [f"! {fault}" for fault in r["faults"]])
 
 
@@ -70,7 +70,8 @@ def _call(r: Record) -> str:
     place = r.get("position") or {}
     where = ""
     if place.get("latitude_deg") is not None:
-        where = f"  at {place['latitude_deg']:.6f}, {place['longitude_deg']:.6f}"
+        sigma = _number(place.get("semi_major_m"), ".0f", " m")
+        where = f"  at {place['latitude_deg']:.6f}, {place['longitude_deg']:.6f} ±{sigma}"
     if r["event"] == "begin":
         return f"{r['call']} begins  {_direction(r['track'])}  {_snr(r['snr_db'])}{where}"
     seconds = (r["t_ns"] - r["begin_t_ns"]) * 1e-9
@@ -88,6 +89,7 @@ IN_WORDS: dict[str, Callable[[Record], str]] = {
     "stop": lambda _: "",
     "bearing": _bearing,
     "call": _call,
+    "sighting": lambda r: f"{r['caller']} at {_direction(r)} from north",
     "fault": lambda r: f"{'! ' if r['event'] == 'begin' else 'cleared: '}{r['text']}",
     "link": lambda r: "up" if r["up"] else f"down: {r['error'] or 'nobody heard yet'}",
     "source": lambda r: f"no sound: {r['fault']}" if r["fault"] else "sound",
