@@ -118,8 +118,8 @@ def heard(t_ns: int, *places: tuple[int, float | None]) -> Estimate:
     track = Track(1.0, 0.05, -0.3, 0.1, 0.6, 0.0, 0.9, confirmed=True)
     positions = tuple(
         Position(
-            t_ns + 50_000_000, id, lat is not None, lat, None if lat is None else 8.0, 400.0, np.eye(2), 1.0, 1.0,
-            0.0, 0.0, 0.1, age_s=0.2, looks=3,
+            t_ns + 50_000_000, id, lat is not None, lat, None if lat is None else 8.0, 400.0, np.eye(2),
+            1.0, 1.0, 0.0, 0.0, 0.1, age_s=0.2, looks=3,
         )
         for id, lat in places
     )  # fmt: skip

@@ -18,6 +18,7 @@ import flights
 import pytest
 
 from locagen_edge import cli
+from locagen_edge.fusion import fuse
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.framer import Framer
 from locagen_edge.pipeline import Pipeline
@@ -195,3 +196,13 @@ def test_without_poses_there_are_bearings_and_no_place(flown):
     heard = [pipeline.process(replace(f, pose=None)) for f in flights.frames(flown.settings, 3.0)]
     assert any(e.track for e in heard)
     assert not any(e.positions or e.sightings for e in heard)
+
+
+def test_calls_too_far_apart_for_one_track_are_one_caller_on_the_ground(flown):
+    """2.5 s of silence end a track; what was seen of each adds up all the same."""
+    settings = replace(flown.settings, sim=replace(flown.settings.sim, call_s=1.0, pause_s=2.5))
+    pipeline = Pipeline(settings)
+    looks = [look for f in flights.frames(settings, 12.0) for look in pipeline.process(f).sightings]
+    assert len({look.caller for look in looks}) > 2
+    (found,) = fuse(looks, settings.position)
+    assert flights.miss_m(found.position.latitude_deg, found.position.longitude_deg) < NEAR_M
