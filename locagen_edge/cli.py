@@ -301,23 +301,16 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 def _run(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
-    callers = None
-    if arguments.export is not None:
-        from locagen_edge.export import Callers
+    callers, recorder = _callers(arguments), None
+    with contextlib.ExitStack() as ending:
+        if callers is not None:
+            ending.callback(_export_news, callers)
+        if arguments.record is not None:
+            from locagen_edge.store.recorder import Recorder
 
-        callers = Callers(arguments.export)
-    recorder = None
-    if arguments.record is not None:
-        from locagen_edge.store.recorder import Recorder
-
-        recorder = Recorder(arguments.record, settings)
-    try:
+            recorder = Recorder(arguments.record, settings)
+            ending.callback(recorder.close)
         asyncio.run(_serve(settings, arguments.seconds, recorder, callers, quiet=arguments.quiet))
-    finally:
-        if recorder is not None:
-            recorder.close()
-        if callers is not None and callers.changed:
-            _export(callers)
     return 0
 
 
@@ -349,7 +342,7 @@ async def _serve(
         if callers is not None and callers.changed and loop.time() >= export_s:
             export_s = loop.time() + EXPORT_S
             callers.changed = False
-            loop.run_in_executor(None, _export_or_tell, callers.path, callers.events)
+            loop.run_in_executor(None, _export_or_tell, callers, callers.events)
         if not quiet:
             live(daemon)
         if recorder is not None and recorder.failure and not told:
@@ -396,6 +389,20 @@ def _utc_ns(frame: Frame) -> int:
     return time.time_ns() - time.monotonic_ns() + frame.t_ns
 
 
+def _callers(arguments: argparse.Namespace) -> Callers | None:
+    if arguments.export is None:
+        return None
+    from locagen_edge.export import Callers
+
+    return Callers(arguments.export)
+
+
+def _export_news(callers: Callers) -> None:
+    """Where nobody has been placed, what an earlier run has written stays."""
+    if callers.changed:
+        _export(callers)
+
+
 def _export(callers: Callers) -> None:
     from locagen_edge.export import export
 
@@ -403,13 +410,14 @@ def _export(callers: Callers) -> None:
     print(f"locagen-edge: {len(callers.events)} callers in {callers.path}", file=sys.stderr)
 
 
-def _export_or_tell(path: Path, events: list[Event]) -> None:
+def _export_or_tell(callers: Callers, events: list[Event]) -> None:
     """From a thread: a disk may take its time, and one that is full is no reason to stop."""
     from locagen_edge.export import export
 
     try:
-        export(events, path)
+        export(events, callers.path)
     except ExportError as error:
+        callers.changed = True  # so it is tried again
         logging.error("%s", error)
 
 
@@ -550,11 +558,7 @@ def _caller_in_words(c: dict[str, Any]) -> str:
 
 def _replay(arguments: argparse.Namespace) -> int:
     files = _recordings(arguments.files)
-    callers = None
-    if arguments.export is not None:
-        from locagen_edge.export import Callers
-
-        callers = Callers(arguments.export)
+    callers = _callers(arguments)
     beside = files[0].with_suffix(".toml")
     if arguments.settings is None and beside.is_file():
         logging.info("settings: %s", beside)

@@ -29,6 +29,8 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))
 """Semi-axes of the 95 % ellipse over those of 1-sigma: 2.45."""
 CORNERS = 48
+MOST = 1000
+"""Callers kept for one file; beyond that the first goes."""
 DIGITS = 7
 """Of degrees: a centimetre."""
 NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -107,7 +109,7 @@ def _check_ending(path: Path) -> None:
 
 
 class Callers:
-    """The last known place of each caller of a stream, on the way into a map file.
+    """The last known place of each caller of a stream, on the way into a map file, the last MOST of them.
 
     Raises `ExportError` at once where the file could not be written.
     """
@@ -133,6 +135,8 @@ class Callers:
             told = event(position, heard_ns, name=f"caller {track.id}", confidence=track.confidence)
             if told is not None:
                 self._events[track.id] = told
+                if len(self._events) > MOST:
+                    del self._events[next(iter(self._events))]
                 self.changed = True
 
     @property

@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from locagen_edge.cli import _export_news, _export_or_tell
 from locagen_edge.errors import ExportError
-from locagen_edge.export import FORMATS, SCALE_95, Callers, Event, ellipse, export, geojson, gpx, kml
+from locagen_edge.export import FORMATS, MOST, SCALE_95, Callers, Event, ellipse, export, geojson, gpx, kml
 from locagen_edge.geodesy import north_east_down_m
 from locagen_edge.types import Bearing, Detection, Estimate, Position, Tdoa, Track
 
@@ -152,6 +153,26 @@ def test_callers_keep_their_last_place_after_their_track(tmp_path):
     assert [(e.name, e.latitude_deg) for e in callers.events] == [("caller 1", 47.2), ("caller 2", 47.3)]
     # when it was heard: the sound's middle, less its age
     assert callers.events[0].t_ns == T_NS + 10**9 + 50_000_000 - 200_000_000
+
+
+def test_callers_are_bounded(tmp_path):
+    callers = Callers(tmp_path / "callers.geojson")
+    for id in range(MOST + 5):
+        callers.hear(heard(0, (id, 47.0)), T_NS)
+    assert [e.name for e in callers.events] == [f"caller {id}" for id in range(5, MOST + 5)]
+
+
+def test_an_export_that_fails_under_way_is_told_and_tried_again(tmp_path, caplog):
+    callers = Callers(tmp_path / "callers.geojson")
+    callers.hear(heard(0, (1, 47.0)), T_NS)
+    callers.changed = False
+    callers.path = tmp_path / "gone" / "callers.geojson"
+    _export_or_tell(callers, callers.events)
+    assert "cannot be written" in caplog.text
+    assert callers.changed
+    callers.path = tmp_path / "callers.geojson"
+    _export_news(callers)
+    assert "caller 1" in callers.path.read_text()
 
 
 @pytest.mark.parametrize(
