@@ -10,7 +10,8 @@ endif
 BIN    := $(VENV)/bin
 CFLAGS_C := -std=gnu11 -Wall -Wextra -Werror -fno-math-errno -fno-trapping-math
 KERNEL_C := $(filter-out csrc/test_kernel.c, $(wildcard csrc/*.c))
-KERNEL := $(wildcard csrc/*.c csrc/*.h) csrc/build_kernel.py setup.py pyproject.toml
+KERNEL := $(wildcard csrc/*.c csrc/*.h) csrc/build_kernel.py setup.py pyproject.toml \
+    locagen_edge/mavlink/locagen.xml locagen_edge/mavlink/build_dialect.py
 SYSTEMD_DIR := /lib/systemd/system
 SYSUSERS_DIR := /usr/lib/sysusers.d
 LIB_DIR := /opt/locagen-edge
@@ -75,6 +76,7 @@ check: $(VENV)/.dev ## lint, format, types: what CI runs before the tests
 format: $(VENV)/.dev ## rewrites the sources in the one format, the sample settings from their one source
 	$(BIN)/ruff check --fix -q . ; $(BIN)/ruff format .
 	$(BIN)/python -m locagen_edge.settings > systemd/locagen-edge.toml.tmp && mv systemd/locagen-edge.toml.tmp systemd/locagen-edge.toml
+	$(BIN)/python -m locagen_edge.mavlink.build_dialect --docs docs/mavlink.md
 
 $(VENV)/.dev: $(VENV)/.flight
 	@echo "setting up $(VENV) for development (once)"
@@ -100,6 +102,7 @@ csrc-test-aarch64: ## the same for aarch64 under qemu-user
 .PHONY: nightly
 nightly: $(VENV)/.dev csrc-test csrc-test-aarch64 ## the tests with many more and new examples
 	LOCAGEN_NIGHTLY=1 $(BIN)/python -m pytest
+	PYTHONPATH=. $(BIN)/python tests/mavlink/fuzz.py --inputs 10000000
 
 .PHONY: bench
 bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
@@ -107,12 +110,19 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(BIN)/python bench/bench_kernel.py
 	$(BIN)/python bench/bench_steered.py
 	$(BIN)/python bench/bench_pipeline.py
+	$(BIN)/python bench/bench_framer.py
 	$(BIN)/python bench/bench_accuracy.py --trials 100
 	$(BIN)/python bench/bench_twin.py
+	$(BIN)/python bench/bench_position.py
 
 .PHONY: models
 models: $(VENV)/.dev ## trains the models anew
 	$(BIN)/locagen-lab train --settings models/tdoa-mlp.toml --name tdoa-mlp --models models --out build/tdoa-mlp
+
+.PHONY: wireshark
+wireshark: $(VENV)/.dev ## a Wireshark dissector of all our messages, build/locagen.lua
+	@mkdir -p build
+	$(BIN)/python -m locagen_edge.mavlink.build_dialect --lua build/locagen.lua
 
 .PHONY: paper
 paper: $(VENV)/.dev ## repeats the paper's experiments, into paper-report/ (some minutes)
@@ -128,7 +138,7 @@ install: ## as root: program, unit, user and sample settings; DESTDIR is honoure
 	$(PYTHON) -m venv $(DESTDIR)$(LIB_DIR)
 	@# built from a copy: root leaves nothing behind in the checkout
 	@copy=$$(mktemp -d) && cp -r csrc locagen_edge models pyproject.toml setup.py MANIFEST.in README.md LICENSE $$copy && \
-	    rm -f $$copy/locagen_edge/*.so && $(DESTDIR)$(LIB_DIR)/bin/pip install -q $$copy; ok=$$?; rm -rf $$copy; exit $$ok
+	    rm -f $$copy/locagen_edge/*.so $$copy/locagen_edge/mavlink/_messages.py && $(DESTDIR)$(LIB_DIR)/bin/pip install -q $$copy; ok=$$?; rm -rf $$copy; exit $$ok
 	@# scripts name their interpreter: the place where it will be, not where it is packed
 	@test -z "$(DESTDIR)" || grep -rlI '^#!$(DESTDIR)' $(DESTDIR)$(LIB_DIR)/bin | xargs -r sed -i '1s|^#!$(DESTDIR)|#!|'
 	install -m 644 systemd/locagen-edge.service $(DESTDIR)$(SYSTEMD_DIR)/
@@ -145,4 +155,4 @@ uninstall: ## removes all that install brought; the settings stay
 
 .PHONY: clean
 clean: ## removes what was built, the virtual environment too
-	rm -rf build dist *.egg-info $(VENV) locagen_edge/*.so
+	rm -rf build dist *.egg-info $(VENV) locagen_edge/*.so locagen_edge/mavlink/_messages.py

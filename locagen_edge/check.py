@@ -12,6 +12,7 @@ from dataclasses import replace
 from locagen_edge.errors import LocagenError, SourceHungError
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.link import Link, parse
+from locagen_edge.mavlink.signing import Guard, guard_of
 from locagen_edge.models import directory_of, load_model, read_manifest
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import BearingSettings, Settings
@@ -40,7 +41,15 @@ def check(settings: Settings, seconds: float) -> Iterator[Finding]:
         # the microphones can still be judged
         pipeline = Pipeline(replace(settings, bearing=BearingSettings()))
     yield from asyncio.run(_listen(settings, pipeline, max(seconds, LEAST_S)))
-    yield asyncio.run(_link(settings, seconds))
+    try:
+        guard = guard_of(settings)
+    except LocagenError as error:
+        yield False, "signing", str(error)
+        guard = Guard()
+    for link in settings.mavlink.link:
+        yield asyncio.run(_link(settings, link, guard, seconds))
+    for complaint in guard.complaints(math.inf):
+        yield False, "signing", complaint
 
 
 def _models(settings: Settings) -> Iterator[Finding]:
@@ -87,11 +96,11 @@ async def _listen(settings: Settings, pipeline: Pipeline, seconds: float) -> lis
     return found or [(True, "microphones", f"{frames} frames, level {level_dbfs:.0f} dBFS in the band")]
 
 
-async def _link(settings: Settings, seconds: float) -> Finding:
-    """Opens the link, says one heartbeat, and waits for an autopilot's."""
-    component = Component(settings.mavlink)
+async def _link(settings: Settings, name: str, guard: Guard, seconds: float) -> Finding:
+    """Opens a link, says one heartbeat, and waits for an autopilot's."""
+    component = Component(settings.mavlink, guard=guard)
     link = Link(
-        parse(settings.mavlink.link),
+        parse(name),
         backoff_s=settings.daemon.backoff_s,
         on_bytes=lambda data: component.receive(data, time.monotonic()),
     )
@@ -102,18 +111,17 @@ async def _link(settings: Settings, seconds: float) -> Finding:
             if component.autopilot_heard_s is not None:
                 break
             if link.up and not told:
-                told = all(link.send(frame) for frame in component.due(time.monotonic(), ALIVE))
+                told = all(link.send(guard.sign(frame)) for frame in component.due(time.monotonic(), ALIVE))
             await asyncio.sleep(0.05)
         up = link.up
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-    name = settings.mavlink.link
     if component.autopilot_heard_s is not None:
         return True, "link", f"{name}: an autopilot answers, system {component.system_id}"
     if up:  # one-way links to a ground station are legal, and it may start later: said, but no fault
         nobody = "but nobody listens there yet" if link.refused else f"no autopilot heard in {seconds:g} s"
         return True, "link", f"{name}: open, {nobody}"
-    if name.startswith("udpin:") and not link.last_error:
+    if name.startswith(("udpin:", "tcpin:")) and not link.last_error:
         return True, "link", f"{name}: open, nobody has been heard in {seconds:g} s"
     return False, "link", f"{name}: {link.last_error or f'not open after {seconds:g} s'}"

@@ -22,19 +22,24 @@ from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from locagen_edge.errors import SourceError, SourceHungError
-from locagen_edge.mavlink.component import Component, Status
-from locagen_edge.mavlink.link import Link, parse
+from locagen_edge.errors import LinkError, SourceError, SourceHungError
+from locagen_edge.mavlink.component import Component, Status, is_confirmed
+from locagen_edge.mavlink.link import parse
+from locagen_edge.mavlink.links import Links
+from locagen_edge.mavlink.signing import SAVE_S, guard_of, save_timestamp, state_file
 from locagen_edge.notify import notify
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings
 from locagen_edge.sources import open_source
+from locagen_edge.store.blackbox import BlackBox, directory_of
 from locagen_edge.types import Estimate, Frame
 
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
 """How often what is due is sent: a tenth of the heartbeat's period."""
+SAY_AGAIN_S = 10.0
+"""What holds is told again to all when one more link comes up, but no more often than this."""
 FIRST_WAIT_S = 0.5
 STOP_S = 0.9
 """All of shutdown has to end within a second: source, then queue, then the rest, with what is left of it."""
@@ -59,9 +64,10 @@ class Counters:
 
 
 class Daemon:
-    """One source, one pipeline, one link.
+    """One source, one pipeline, one component on all its links.
 
-    `on_second(daemon)` is called once per second of the main loop. `sources` opens the source that the
+    `on_second(daemon)` is called once per second of the main loop, `on_estimate(frame, estimate)` for each
+    frame; neither may wait. `sources` opens the source that the
     settings name; a test passes its own.
     """
 
@@ -70,13 +76,17 @@ class Daemon:
         settings: Settings,
         *,
         on_second: Callable[[Daemon], None] | None = None,
+        on_estimate: Callable[[Frame, Estimate], None] | None = None,
         sources: Callable[[Settings], AsyncGenerator[Frame, None]] = open_source,
     ):
         self.settings = settings
         self.counters = Counters()
         self.estimate: Estimate | None = None
+        self._middle_ns = 0  # of its frame
         self.source_fault = ""
+        self.black_box: BlackBox | None = None
         self._on_second = on_second
+        self._on_estimate = on_estimate
         self._sources = sources
         self._stopping = asyncio.Event()
         self._queue: asyncio.Queue[Frame | None] = asyncio.Queue()
@@ -85,26 +95,35 @@ class Daemon:
         self._ready = False
         self._working = False
         self._told: BaseException | None = None
-        self._link_was_up = False
+        self._links_up = 0
+        self._said_s = -math.inf
+        self._save_s = math.inf
+        self._complaints: tuple[str, ...] = ()
 
     async def startup(self) -> None:
-        """Makes pipeline and link. Raises `LocagenError` where the settings cannot be flown with."""
-        self.component = Component(self.settings.mavlink, pose=self.settings.pose)
-        self.link = Link(
-            parse(self.settings.mavlink.link),
+        """Makes pipeline and links. Raises `LocagenError` where the settings cannot be flown with."""
+        guard = guard_of(self.settings)
+        self._save_s = time.monotonic() + SAVE_S if guard.signs else math.inf
+        self.component = Component(self.settings.mavlink, pose=self.settings.pose, guard=guard)
+        self.links = Links(
+            [parse(link) for link in self.settings.mavlink.link],
             backoff_s=self.settings.daemon.backoff_s,
-            on_bytes=lambda data: self.component.receive(data, time.monotonic()),
+            on_bytes=self._receive,
+            guard=guard,
         )
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="pipeline")
         # models load in the worker: the event loop stays free, and they belong to the thread that calls
         loop = asyncio.get_running_loop()
         self.pipeline = await loop.run_in_executor(self._executor, Pipeline, self.settings)
         self._tasks = [
-            asyncio.create_task(self.link.run(), name="link"),
+            asyncio.create_task(self.links.run(), name="links"),
             asyncio.create_task(self._capture(), name="capture"),
             asyncio.create_task(self._work(), name="work"),
             asyncio.create_task(self._tick(), name="tick"),
         ]
+        log_directory = directory_of(self.settings)
+        if log_directory is not None:
+            self.black_box = BlackBox(log_directory, self.settings, is_confirmed)
         notify(STATUS="waiting for the first sound")
 
     async def main_loop(self) -> None:
@@ -142,6 +161,11 @@ class Daemon:
             if task.done() and not task.cancelled() and (error := task.exception()) is not self._told:
                 log.error("while stopping, %s: %s", task.get_name(), error)
         self._executor.shutdown(wait=False, cancel_futures=True)
+        if self.component.guard.signs:
+            self._remember_timestamp()
+        if self.black_box is not None:
+            # it has written all along: only a disk that hangs takes so long
+            self.black_box.close(max(start + STOP_S - time.monotonic(), 0.05))
         return not hanging and not self._working
 
     # --- source -> queue
@@ -186,15 +210,20 @@ class Daemon:
 
     async def _work(self) -> None:
         loop = asyncio.get_running_loop()
-        frame_ns = round(self.settings.audio.frame / self.settings.audio.rate_hz * 1e9)
         while (frame := await self._queue.get()) is not None:
             self._working = True
-            pose = self.component.poses.at(frame.t_ns + frame_ns // 2)
-            self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
+            pose = frame.pose or self.component.poses.at(frame.middle_ns)
+            estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
+            self.estimate, self._middle_ns = estimate, frame.middle_ns
             self._working = False
+            if self.black_box is not None:
+                self.black_box.hear(frame, estimate)
+            if self._on_estimate is not None:
+                self._on_estimate(frame, estimate)
             self._heard_s = time.monotonic()
             self.counters.estimates += 1
-            self.counters.latency_s.append((time.monotonic_ns() - frame.t_ns - frame_ns) * 1e-9)
+            end_ns = 2 * frame.middle_ns - frame.t_ns
+            self.counters.latency_s.append((time.monotonic_ns() - end_ns) * 1e-9)
             self._send()
             self._tell_ready()
 
@@ -211,14 +240,25 @@ class Daemon:
 
     def _send(self) -> None:
         """Sends what is due. While the link is down nothing is: it would be said to nobody."""
-        if not self.link.up:
-            self._link_was_up = False
-            return
-        if not self._link_was_up:
-            self._link_was_up = True
+        up, now_s = self.links.up, time.monotonic()
+        # Who has just come up has heard nothing; but one that flaps must not make all others hear it again.
+        if up > self._links_up and (not self._links_up or now_s - self._said_s > SAY_AGAIN_S):
             self.component.say_again()
-        for message in self.component.due(time.monotonic(), self._status()):
-            self.link.send(message)
+            self._said_s = now_s
+        self._links_up = up
+        if not up:
+            return
+        for message in self.component.due(now_s, self._status()):
+            self.links.send(message)
+
+    def _receive(self, number: int, data: bytes) -> None:
+        """Bytes from a link. What is asked there is answered there."""
+        self.component.receive(data, time.monotonic(), number)
+        self._answer(number)
+
+    def _answer(self, number: int) -> None:
+        for message in self.component.answers(number):
+            self.links.answer(number, message)
 
     def _status(self) -> Status:
         if not self.hearing:
@@ -227,8 +267,18 @@ class Daemon:
         estimate = self.estimate
         if estimate is None:
             return Status(hearing=True, track=None, snr_db=0.0, faults=())
+        detection = estimate.detection
         return Status(
-            True, estimate.track, estimate.detection.snr_db, estimate.faults, others=estimate.tracks[1:]
+            hearing=True,
+            track=estimate.track,
+            snr_db=detection.snr_db,
+            faults=estimate.faults,
+            others=estimate.tracks[1:],
+            positions=estimate.positions,
+            t_ns=self._middle_ns,
+            noise_dbfs=detection.level_dbfs - detection.snr_db,
+            pose=estimate.pose,
+            simulated=self.settings.audio.source != "alsa",
         )
 
     async def _tick(self) -> None:
@@ -237,20 +287,54 @@ class Daemon:
         while True:
             await asyncio.sleep(TICK_S)
             self._send()
+            for number in range(len(self.links.links)):
+                self._answer(number)
             if time.monotonic() < next_s:
                 continue
             next_s = max(next_s, time.monotonic() - 1.0) + 1.0  # after a suspension no second is made up for
             if self._on_second is not None:
                 self._on_second(self)
+            self._watch_signing()
             if self.hearing or self.source_fault:
                 notify(WATCHDOG="1", STATUS=self._in_words())
             else:
                 notify(STATUS=self._in_words())
             self.counters.latency_s.clear()
+            if self.black_box is not None:
+                self.black_box.watch(**self._states())
+
+    def _states(self) -> dict[str, dict[str, object]]:
+        """What the black box keeps the changes of."""
+        c = self.counters
+        return {
+            "link": {"up": self.links.up == len(self.links.links), "error": self.links.last_error},
+            "source": {"fault": self.source_fault},
+            "losses": {"frames": c.dropped, "overruns": c.overruns, "messages": self.links.dropped},
+        }
+
+    def _watch_signing(self) -> None:
+        """Tells the log what the other end does not: that it ignores us. Keeps the timestamp."""
+        complaints = self.component.guard.complaints(time.monotonic())
+        for complaint in set(complaints) - set(self._complaints):
+            log.warning("%s (mavlink.signing_key)", complaint)
+        self._complaints = complaints
+        if time.monotonic() >= self._save_s:
+            self._save_s = time.monotonic() + SAVE_S
+            # a disk may take its time: not on the loop that carries sound
+            asyncio.get_running_loop().run_in_executor(None, self._remember_timestamp)
+
+    def _remember_timestamp(self) -> None:
+        try:
+            save_timestamp(state_file(self.settings), self.component.guard.timestamp)
+        except LinkError as error:
+            log.error("%s", error)
 
     def _in_words(self) -> str:
         """The service manager's status line: state, and every loss since the start."""
         c = self.counters
         state = "listening" if self.hearing else f"no sound: {self.source_fault or 'waiting'}"
-        losses = f"{c.dropped} dropped, {c.overruns} overruns, {self.link.dropped} messages lost"
-        return f"{state}; {c.estimates} frames, {losses}"
+        losses = f"{c.dropped} dropped, {c.overruns} overruns, {self.links.dropped} messages lost"
+        if self.black_box is not None and self.black_box.lost:
+            losses += f", {self.black_box.lost} log records lost"
+        down = [f"link down: {self.links.last_error}"] if self.links.last_error else []
+        return "; ".join([state, f"{c.estimates} frames, {losses}", *down, *self._complaints])

@@ -65,3 +65,11 @@ def test_twin(tmp_path):
     assert {"plain, 1 s", "four rotors", "plain, a frame, features"} <= found["times_real_time"].keys()
     for values in (*found["arrivals_per_s"].values(), *found["times_real_time"].values()):
         assert 0 < values["min"] <= values["median"] <= values["p99"]
+
+
+def test_framer(tmp_path):
+    found = run("bench_framer.py", tmp_path)
+    assert set(found["results"]) == {"clean", "0-10 noise bytes", "0-100 noise bytes"}
+    for result in found["results"].values():
+        assert result["kept"]["framer"] >= found["goals"]["kept"]
+        assert 0 < result["ratio"]["min"] <= result["ratio"]["median"]

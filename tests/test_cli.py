@@ -60,7 +60,9 @@ def recording(tmp_path_factory) -> Path:
 # --- help and usage
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["replay"], ["devices"], ["check"], ["calibrate"]])
+@pytest.mark.parametrize(
+    "command", [[], ["run"], ["replay"], ["record"], ["log"], ["fuse"], ["devices"], ["check"], ["calibrate"]]
+)
 def test_help_is_there(command):
     done = cli(*command, "--help")
     assert done.returncode == 0
@@ -77,6 +79,7 @@ def test_help_is_there(command):
         ["run", "--seconds", "0"],
         ["run", "--seconds", "x"],
         ["replay", "a", "--format", "xml"],
+        ["record", "--seconds", "-1"],
     ],
 )
 def test_wrong_usage_is_exit_code_2(arguments):
@@ -339,6 +342,16 @@ def test_a_port_that_cannot_be_is_refused_in_one_line(tmp_path, link, says):
     path = tmp_path / "s.toml"
     path.write_text(f'[mavlink]\nlink = "{link}"\n')
     fails(1, says, "run", "--settings", path)
+
+
+def test_a_key_that_others_may_read_is_refused_in_one_line(tmp_path):
+    key, path = tmp_path / "key", tmp_path / "s.toml"
+    key.write_text("a passphrase")
+    key.chmod(0o644)
+    path.write_text(f'[mavlink]\nsigning_key = "{key}"\n')
+    fails(1, f"chmod 600 {key}", "run", "--settings", path)
+    done = cli("check", "--seconds", "1", "--settings", path)
+    assert f"WRONG  signing: mavlink.signing_key: {key}: others may read it" in done.stdout
 
 
 def test_a_port_that_is_taken_is_told_while_the_daemon_goes_on(tmp_path):

@@ -25,10 +25,11 @@ from pymavlink.dialects.v20 import common
 from scenes import cut, heard
 
 from locagen_edge.daemon import Daemon
-from locagen_edge.errors import ModelError, SourceError, SourceHungError
+from locagen_edge.errors import LinkError, ModelError, SourceError, SourceHungError
 from locagen_edge.geometry import quaternion, wrap
-from locagen_edge.mavlink import dialect
+from locagen_edge.mavlink import dialect, signing
 from locagen_edge.mavlink.framer import Framer
+from locagen_edge.mavlink.signing import Guard
 from locagen_edge.settings import Settings, from_table
 from locagen_edge.types import Frame, Pose
 
@@ -86,6 +87,14 @@ def messages(server: socket.socket) -> list:
             found += [dialect.decode(packet.raw) for packet in framer.feed(server.recv(2048))]
         except BlockingIOError:
             return found
+
+
+def datagrams(server: socket.socket) -> list[bytes]:
+    found = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            found.append(server.recv(2048))
+    return found
 
 
 @pytest.fixture
@@ -221,7 +230,7 @@ def test_a_failing_source_is_reopened_and_told_while_the_link_goes_on(ground):
             await until(lambda: daemon.source_fault)
             await until(lambda: not daemon.hearing)
             before = daemon.component.sent["HEARTBEAT"]
-            assert daemon.link.up
+            assert daemon.links.up
             await until(lambda: daemon.counters.source_failures >= 3)
             assert daemon.counters.frames >= 10
             assert daemon.component.sent["HEARTBEAT"] - before <= 3  # only in the moments when it heard
@@ -275,8 +284,64 @@ def test_a_link_that_cannot_be_opened_does_not_stop_the_sound():
 
     async def test() -> None:
         async with running(settings, sources=source(settings)) as daemon:
-            await until(lambda: daemon.counters.estimates > 20 and daemon.link.last_error)
-            assert not daemon.link.up
+            await until(lambda: daemon.counters.estimates > 20 and daemon.links.last_error)
+            assert not daemon.links.up
+
+    asyncio.run(test())
+
+
+def test_a_dead_link_costs_the_other_nothing(ground):
+    dead = f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    settings = from_table({"mavlink": {"link": [dead, f"udpout:127.0.0.1:{port_of(ground)}"]}})
+
+    async def test() -> None:
+        async with running(settings, sources=source(settings)) as daemon:
+            await until(lambda: daemon.component.sent["HEARTBEAT"] >= 2 and daemon.links.last_error)
+            assert daemon.links.up == 1
+            assert daemon.links.dropped == 0
+            assert f"link down: {dead}: Connection refused" in daemon._in_words()
+
+    asyncio.run(test())
+    assert [m.get_type() for m in messages(ground)].count("HEARTBEAT") >= 2
+
+
+def test_with_a_key_all_is_signed_and_the_timestamp_outlives_the_daemon(ground, tmp_path):
+    key = tmp_path / "key"
+    key.write_text("a passphrase")
+    key.chmod(0o600)
+    mavlink = {
+        "link": f"udpout:127.0.0.1:{port_of(ground)}",
+        "signing_key": str(key),
+        "signing_state": str(tmp_path),
+    }
+    settings = from_table({"mavlink": mavlink})
+    stamps = []
+
+    async def test() -> None:
+        async with running(settings, sources=source(settings)) as daemon:
+            await until(lambda: daemon.component.sent["HEARTBEAT"] >= 1)
+        stamps.append(daemon.component.guard.timestamp)
+
+    for _ in range(2):
+        asyncio.run(test())
+        assert signing.load_timestamp(signing.state_file(settings)) > stamps[-1]
+    assert stamps[1] > stamps[0]
+    reader = Guard(signing.read_key(key), timestamp=stamps[0])
+    ground.setblocking(False)
+    packets = [packet for frame in datagrams(ground) for packet in Framer().feed(frame)]
+    assert packets
+    assert all(reader.admit(packet, 0.0) for packet in packets)
+
+
+def test_an_unfit_key_stops_the_start(tmp_path):
+    key = tmp_path / "key"
+    key.write_text("a passphrase")
+    key.chmod(0o644)
+
+    async def test() -> None:
+        daemon = Daemon(from_table({"mavlink": {"signing_key": str(key)}}))
+        with pytest.raises(LinkError, match="chmod 600"):
+            await daemon.startup()
 
     asyncio.run(test())
 

@@ -82,6 +82,12 @@ BAD = {
     "a number without end": ({"sim": {"distance_m": 10**400}}, "sim.distance_m: inf is not"),
     "port": ({"mavlink": {"link": "tcp:127.0.0.1:99999"}}, "mavlink.link: port 99999 is not"),
     "port 0": ({"mavlink": {"link": "udpin:0.0.0.0:0"}}, "mavlink.link: port 0 is not"),
+    "no link": ({"mavlink": {"link": []}}, "mavlink.link: 0 links; 1 to 8"),
+    "a link twice": (
+        {"mavlink": {"link": ["tcp:a:1", "tcp:a:1"]}},
+        "mavlink.link: 'tcp:a:1' is there twice",
+    ),
+    "one link of two": ({"mavlink": {"link": ["tcp:a:1", "udp:b"]}}, "mavlink.link: 'udp:b'"),
     "baud": ({"mavlink": {"link": "serial:/dev/ttyS0:99999999"}}, "mavlink.link: baud rate 99999999"),
     "stall under a hop": (
         {
@@ -187,6 +193,12 @@ def test_unreadable_files_are_told_in_one_line(tmp_path, content, says):
         load(path)
     assert len(str(caught.value).splitlines()) == 1
     assert str(path) in str(caught.value)
+
+
+def test_one_link_may_be_written_without_brackets():
+    one, many = "udpin:0.0.0.0:14550", ["udpin:0.0.0.0:14550", "serial:/dev/ttyAMA0:921600"]
+    assert from_table({"mavlink": {"link": one}}).mavlink.link == (one,)
+    assert from_table({"mavlink": {"link": many}}).mavlink.link == tuple(many)
 
 
 def test_a_mounted_array_is_where_the_vehicle_has_it():

@@ -12,10 +12,15 @@ The profile, for any ground station and autopilot as they are:
   above the horizon, or that of the body where the attitude is not known; left out where the array cannot
   tell), LG_SIG (1-sigma of the azimuth, degrees: of LG_AZ where it is sent, compass and all), LG_CONF (0 to
   1), LG_SNR (dB, in-band).
-- STATUSTEXT once per confirmed call, once per fault and once when a fault has gone.
+- LOCAGEN_BEARING at the same rate for the best track and every other confirmed one, LOCAGEN_POSITION for
+  those whose place is known; once a second that nothing is heard. As messages and inside TUNNEL
+  (`mavlink.records`).
+- STATUSTEXT once per confirmed call, once when its place is known, once per fault and once when a fault has
+  gone.
 - COMMAND_LONG to the autopilot, to have its attitude and position sent: never any other command.
 
-ArduPilot forwards the first three between its links and writes the last two into its log. Times are monotonic
+ArduPilot forwards HEARTBEAT, NAMED_VALUE_FLOAT, TUNNEL and STATUSTEXT between its links, and writes values
+and texts into its log. Times are monotonic
 seconds. Call `due` only while the link is up, and `say_again` when it has come up: then nothing that
 holds is said to nobody.
 """
@@ -24,18 +29,21 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import Counter, deque
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
+from locagen_edge.geodesy import north_east_down_m
 from locagen_edge.geometry import compass_deg
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.framer import Framer, Packet
 from locagen_edge.mavlink.pose import READ, PoseHistory
+from locagen_edge.mavlink.records import BearingRecord, PositionRecord, bearing_message, position_message
+from locagen_edge.mavlink.signing import Guard
 from locagen_edge.mavlink.streams import Streams
 from locagen_edge.settings import MavlinkSettings, PoseSettings
-from locagen_edge.types import Track
+from locagen_edge.types import Pose, Position, Track
 
 HEARTBEAT_S = 1.0
 """what MAVLink's heartbeat protocol asks of every component"""
@@ -48,10 +56,16 @@ FAULT_GONE_S = 5.0
 """a fault has gone when it stayed away this long: one that flickers is told once, not each time"""
 TEXT_S = 0.5
 """least mean distance of two texts: a radio link at 57600 baud and a reader's eye both bear it"""
+NOTHING_S = 1.0
+"""how often it is told that nothing is heard"""
 CALLS_REMEMBERED = 16
 """tracks of which the operator was told; more than can be followed at a time"""
 TEXTS_WAITING = 8
 """texts that may wait, 4 s of them; beyond that the newest is dropped and counted"""
+ANSWERS_AT_ONCE = 10
+"""answers to a link at a time, 100 a second: a radio link carries no more"""
+ANSWERS_WAITING = 64
+"""answers that may wait for a link; beyond that the oldest goes, whoever asked will ask again"""
 
 _FIRST_SYSTEM_ID = 1  # until the autopilot is heard; every autopilot's default
 _GROUND_STATION_ID = 255
@@ -69,6 +83,21 @@ class Status:
     """what is wrong now, in words for the operator; the same fault always in the same words"""
     others: tuple[Track, ...] = ()
     """callers beside `track`; the operator is told of each, values are sent of `track` alone"""
+    positions: tuple[Position, ...] = ()
+    """of any of them, by the track's id"""
+    t_ns: int = 0
+    """monotonic time of the middle of the sound that all this follows from"""
+    noise_dbfs: float | None = None
+    """tracked background"""
+    pose: Pose | None = None
+    """of the vehicle at that time"""
+    simulated: bool = False
+    """the sound is synthetic or recorded"""
+
+    def place(self, track: Track) -> Position | None:
+        """Where the caller of this track is; None too where no range is observable."""
+        found = (p for p in self.positions if p.caller == track.id and p.latitude_deg is not None)
+        return next(found, None)
 
 
 class Component:
@@ -79,18 +108,29 @@ class Component:
     """
 
     def __init__(
-        self, settings: MavlinkSettings, start_s: float = 0.0, pose: PoseSettings | None = None
+        self,
+        settings: MavlinkSettings,
+        start_s: float = 0.0,
+        pose: PoseSettings | None = None,
+        guard: Guard | None = None,
     ) -> None:
+        self.guard = guard or Guard()
+        """who may speak to us"""
         self._fixed_id = settings.system_id
         self._start_s = start_s
-        self._framer = Framer()
+        self.received: defaultdict[int, Framer] = defaultdict(Framer)
+        """the framers by link, for their counters"""
+        self._answers: defaultdict[int, deque[bytes]] = defaultdict(lambda: deque(maxlen=ANSWERS_WAITING))
         self._sender = dialect.Sender(self._fixed_id or _FIRST_SYSTEM_ID, settings.component_id)
         self._heartbeat = _Every(HEARTBEAT_S)
         self._values = _Every(1.0 / settings.rate_hz)
+        self._ways = [WAYS[way] for way in settings.records]
+        self._bearings, self._nothing = _Every(1.0 / settings.rate_hz), _Every(NOTHING_S)
         self._text = _Every(TEXT_S)
         self._texts: deque[tuple[int, str]] = deque()
         self._faults: dict[str, float] = {}  # told, and when each was last there
         self._told: deque[int] = deque(maxlen=CALLS_REMEMBERED)
+        self._placed: deque[int] = deque(maxlen=CALLS_REMEMBERED)
         pose = pose or PoseSettings()
         self._streams = Streams(pose.rate_hz)
         self.poses = PoseHistory(pose)
@@ -107,18 +147,19 @@ class Component:
         """The id under which we send."""
         return self._sender.system_id
 
-    @property
-    def received(self) -> Framer:
-        """The framer, for its counters."""
-        return self._framer
-
     # --- in -------------------------------------------------------------------------------------------
 
-    def receive(self, data: bytes, now_s: float) -> None:
-        """Takes bytes from the link. Never raises on what they hold."""
-        for packet in self._framer.feed(data):
+    def receive(self, data: bytes, now_s: float, link: int = 0) -> None:
+        """Takes bytes from a link, by its number. Never raises on what they hold."""
+        for packet in self.received[link].feed(data):
+            if not self.guard.admit(packet, now_s):
+                continue
             if packet.message_id == dialect.HEARTBEAT and _is_autopilot(packet):
                 self._hear_autopilot(packet.system_id, now_s)
+            elif packet.message_id == dialect.COMMAND_ACK:
+                self._hear_answer(packet)
+            elif packet.message_id == dialect.PING:
+                self._hear_ping(packet, link)
             elif packet.message_id in READ:
                 self._hear_pose(packet, now_s)
 
@@ -141,20 +182,44 @@ class Component:
         if self.poses.reboots > reboots:
             self._streams.ask_all()
 
+    def _hear_answer(self, packet: Packet) -> None:
+        """The autopilot answers; older firmware names no target."""
+        message = dialect.decode(packet.raw)
+        if packet.system_id == self.system_id and message.target_component in (0, self._sender.component_id):
+            self.guard.answered()
+
+    def _hear_ping(self, packet: Packet, link: int) -> None:
+        """A ping at nobody in particular asks all to answer it to its sender."""
+        message = dialect.decode(packet.raw)
+        if message.target_system == 0 and message.target_component == 0:
+            answer = dialect.ping(message, packet.system_id, packet.component_id)
+            self._answers[link].append(self._pack("PING", answer))
+
     # --- out ------------------------------------------------------------------------------------------
 
     def due(self, now_s: float, status: Status) -> list[bytes]:
         """The frames to send now. Call it several times as often as `rate_hz`, at least 10 times a second."""
-        self._follow_faults(now_s, status.faults)
+        self._follow_faults(now_s, (*status.faults, *self.guard.complaints(now_s)))
         if status.hearing:
             self._follow_call(status)
-        return [self._pack(name, message) for name, message in self._messages(now_s, status)]
+        frames = []
+        for name, message in self._messages(now_s, status):
+            frames.append(self._pack(name, message))
+            if name == "COMMAND_LONG":
+                self.guard.asked(now_s)
+        return frames
+
+    def answers(self, link: int) -> list[bytes]:
+        """The frames that go to this link alone, as many as may go now."""
+        waiting = self._answers[link]
+        return [waiting.popleft() for _ in range(min(len(waiting), ANSWERS_AT_ONCE))]
 
     def say_again(self) -> None:
         """The link has come up: tell again what holds now, to whoever is there now."""
         self._texts.clear()
         self._faults.clear()
         self._told.clear()
+        self._placed.clear()
 
     def _messages(self, now_s: float, status: Status) -> Iterator[tuple[str, Any]]:
         if status.hearing and self._heartbeat.due(now_s):
@@ -168,6 +233,27 @@ class Component:
             time_boot_ms = round((now_s - self._start_s) * 1000)
             for name, value in bearing_values(status.track, status.snr_db):
                 yield name, dialect.named_value_float(time_boot_ms, name, value)
+        if status.hearing and self._ways:
+            for message in self._records(now_s, status):
+                for name, as_sent in self._ways:
+                    yield name or message.get_type(), as_sent(message)
+
+    def _records(self, now_s: float, status: Status) -> Iterator[Any]:
+        """LOCAGEN_BEARING and LOCAGEN_POSITION of all callers, or that nothing is heard."""
+        time_us = status.t_ns // 1000 - round(self._start_s * 1e6)
+        if status.track is None:
+            if self._nothing.due(now_s):
+                yield bearing_message(_bearing_record(time_us, status, None))
+            return
+        if not self._bearings.due(now_s):
+            return
+        for track in (status.track, *status.others):
+            if track is not status.track and not is_confirmed(track):
+                continue
+            yield bearing_message(_bearing_record(time_us, status, track))
+            place = status.place(track)
+            if place is not None and is_confirmed(track):
+                yield position_message(_position_record(time_us, status, place, track.id in self._placed))
 
     def _pack(self, name: str, message: Any) -> bytes:
         self.sent[name] += 1
@@ -175,9 +261,14 @@ class Component:
 
     def _follow_call(self, status: Status) -> None:
         for track in (status.track, *status.others):
-            if track and track.id not in self._told and is_confirmed(track):
+            if not track or not is_confirmed(track):
+                continue
+            how_far = _how_far(status, track) if track.id not in self._placed else ""
+            if track.id not in self._told or how_far:
+                self._say(dialect.SEVERITY_NOTICE, call_text(track, how_far), first=True)
                 self._told.append(track.id)
-                self._say(dialect.SEVERITY_NOTICE, call_text(track), first=True)
+            if how_far:
+                self._placed.append(track.id)
 
     def _follow_faults(self, now_s: float, faults: tuple[str, ...]) -> None:
         for fault in faults:
@@ -225,8 +316,11 @@ def bearing_values(track: Track, snr_db: float) -> Iterator[tuple[str, float]]:
     yield from _value("LG_SNR", snr_db, -200, 200)
 
 
-def call_text(track: Track) -> str:
-    """One line for the operator, at most 50 characters: where a confirmed call comes from, with 1-sigma."""
+def call_text(track: Track, how_far: str = "") -> str:
+    """One line for the operator, at most 50 characters: where a confirmed call comes from, with 1-sigma.
+
+    `how_far`: the distance in words, where it is known; it takes the place of the bearing's sigma.
+    """
     body = _whole(compass_deg(track.azimuth_rad))
     where, sigma = f"{body} deg clockwise from nose", math.degrees(track.azimuth_sigma_rad)
     if track.earth is not None and not math.isnan(true := compass_deg(track.earth.azimuth_rad)):
@@ -234,7 +328,73 @@ def call_text(track: Track) -> str:
             f"{_whole(true)} deg true, {body} from nose",
             math.degrees(track.earth.azimuth_sigma_rad),
         )
+        if how_far:
+            where = f"{_whole(true)} deg true"
+    if how_far:
+        return f"Call heard: {where}, {how_far}"
     return f"Call heard: {where}" + (f", +-{max(1, round(sigma))} deg" if 0 <= sigma <= 180 else "")
+
+
+def _how_far(status: Status, track: Track) -> str:
+    """How far from the vehicle the caller is, over the ground, with the longer semi-axis (1-sigma)."""
+    place, pose = status.place(track), status.pose
+    if place is None or pose is None or pose.latitude_deg is None or pose.longitude_deg is None:
+        return ""
+    assert place.latitude_deg is not None
+    assert place.longitude_deg is not None
+    away = north_east_down_m(
+        place.latitude_deg, place.longitude_deg, 0.0, pose.latitude_deg, pose.longitude_deg, 0.0
+    )
+    return f"{math.hypot(away[0], away[1]):.0f} m +-{max(1, round(place.semi_major_m))} m"
+
+
+def _bearing_record(time_us: int, status: Status, track: Track | None) -> BearingRecord:
+    heard = BearingRecord(
+        time_us=time_us,
+        autopilot_time=False,
+        event_id=0,
+        snr_db=status.snr_db,
+        noise_dbfs=status.noise_dbfs,
+        pose=status.pose,
+        microphone_fault=bool(status.faults),
+        simulated=status.simulated,
+    )
+    if track is None:
+        return heard
+    return replace(
+        heard,
+        event_id=track.id,
+        azimuth_body_rad=track.azimuth_rad,
+        azimuth_true_rad=None if track.earth is None else track.earth.azimuth_rad,
+        azimuth_sigma_rad=track.azimuth_sigma_rad,
+        elevation_rad=track.elevation_rad,
+        elevation_sigma_rad=None if track.elevation_rad is None else track.elevation_sigma_rad,
+        confidence=track.confidence,
+        confirmed=is_confirmed(track),
+    )
+
+
+def _position_record(time_us: int, status: Status, place: Position, told: bool) -> PositionRecord:
+    assert place.latitude_deg is not None
+    assert place.longitude_deg is not None
+    (nn, ne), (_, ee) = place.covariance_m2.tolist()
+    # the ground at the caller is told where a depression over a height was: without one, bearings crossed
+    on_ground = place.altitude_m is not None
+    return PositionRecord(
+        time_us=time_us,
+        autopilot_time=False,
+        event_id=place.caller,
+        latitude_deg=place.latitude_deg,
+        longitude_deg=place.longitude_deg,
+        altitude_m=place.altitude_m,
+        covariance_m2=(nn, ne, ee),
+        age_s=place.age_s,
+        looks=place.looks,
+        triangulated=not on_ground,
+        on_ground=on_ground,
+        confirmed=told,
+        simulated=status.simulated,
+    )
 
 
 def _whole(degrees: float) -> str:
@@ -255,6 +415,13 @@ def _is_autopilot(packet: Packet) -> bool:
         return False
     message = dialect.decode(packet.raw)
     return bool(message.type != dialect.TYPE_GROUND_STATION and message.autopilot != dialect.AUTOPILOT_NONE)
+
+
+WAYS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "message": ("", lambda message: message),
+    "tunnel": ("TUNNEL", dialect.tunnel),
+}
+"""what `mavlink.records` may name: the message's name where it is another, and how it is made"""
 
 
 class _Every:

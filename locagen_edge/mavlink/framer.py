@@ -4,9 +4,10 @@ Why not the generated parser (pymavlink 2.4.50): after a false start byte it swa
 noise announces (with 1 to 100 noise bytes between frames it keeps 97 to 56 % of them), it returns messages
 of unknown id with their checksum unread, and its buffer grows without bound where chunks always end inside
 a frame. This one gives up one byte at a time, and gives up early: a start byte with flags that do not
-exist, with an id that the dialect does not know (its checksum cannot be verified), or in MAVLink 1 longer
-than its message can be, starts no frame. So noise seldom makes it wait for bytes, and an unknown message
-is passed over like noise.
+exist, with an id that MAVLink does not know (its checksum cannot be verified), or in MAVLink 1 longer than
+its message can be, starts no frame. So noise seldom makes it wait for bytes, and an unknown message is passed
+over like noise. MAVLink 2 frames that are nothing to us are verified and passed over whole: what they carry,
+a log or another's tunnel, may hold bytes that look like a frame.
 
 Framing: mavlink.io/en/guide/serialization.html. Every byte is looked at a bounded number of times (at
 most once per start byte in the 280 bytes before it).
@@ -17,7 +18,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from locagen_edge.mavlink.dialect import LAYOUTS, checksum
+from locagen_edge.mavlink.dialect import LAYOUTS, OTHERS, checksum
 
 _V1 = 0xFE
 _V2 = 0xFD
@@ -25,6 +26,7 @@ _START = re.compile(rb"[\xfd\xfe]")
 _HEADER_V1 = 6
 _HEADER_V2 = 10
 _CHECKSUM = 2
+_ALL = {**OTHERS, **LAYOUTS}
 _SIGNED = 0x01
 _SIGNATURE = 13
 
@@ -52,10 +54,12 @@ class Framer:
         self._rest = b""
         self.frames = 0
         """frames found"""
+        self.others = 0
+        """frames of messages that the dialect leaves out, MAVLink 2"""
         self.bad_crc = 0
         """what looked like a frame and failed its checksum"""
         self.skipped = 0
-        """bytes that belonged to no frame: noise, damage, messages the dialect does not know"""
+        """bytes that belonged to no frame of ours: noise, damage, messages that the dialect leaves out"""
 
     @property
     def waiting(self) -> int:
@@ -78,7 +82,11 @@ class Framer:
             if length > len(buffer) - at:
                 break
             if length and (packet := _checked(buffer[at : at + length])):
-                packets.append(packet)
+                if packet.message_id in LAYOUTS:
+                    packets.append(packet)
+                else:
+                    self.others += 1
+                    self.skipped += length
                 at += length
                 continue
             self.bad_crc += length > 0
@@ -106,7 +114,7 @@ def _length(buffer: bytes, at: int) -> int:
     if there < _HEADER_V2:
         return _HEADER_V2
     # No limit by the layout here: a newer dialect's message may carry more extension fields.
-    if int.from_bytes(buffer[at + 7 : at + 10], "little") not in LAYOUTS:
+    if int.from_bytes(buffer[at + 7 : at + 10], "little") not in _ALL:
         return 0
     return _HEADER_V2 + buffer[at + 1] + _CHECKSUM + (_SIGNATURE if buffer[at + 2] else 0)
 
@@ -117,6 +125,6 @@ def _checked(raw: bytes) -> Packet | None:
     end = (_HEADER_V2 if v2 else _HEADER_V1) + raw[1]
     sequence, system_id, component_id = raw[4:7] if v2 else raw[2:5]
     message_id = int.from_bytes(raw[7:10], "little") if v2 else raw[5]
-    if checksum(raw[1:end], LAYOUTS[message_id].crc_extra) != int.from_bytes(raw[end : end + 2], "little"):
+    if checksum(raw[1:end], _ALL[message_id].crc_extra) != int.from_bytes(raw[end : end + 2], "little"):
         return None
     return Packet(message_id, system_id, component_id, sequence, v2 and bool(raw[2]), raw)

@@ -13,9 +13,11 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import math
 import os
 import random
 import socket
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -45,6 +47,11 @@ KERNEL_BUFFER = 16384
 PEER_GONE_MS = 10_000
 """tcp: a peer that acknowledges nothing for so long is gone (pulled cable); the default is 15 minutes"""
 
+BYTES_PER_S = 150_000
+"""most that is read of a link, 2000 messages of 75 bytes; what a flood brings beyond is dropped, counted"""
+BURST = 300_000
+"""what may come at once: more than one read from a socket gives"""
+
 _MAGIC = (0xFD, 0xFE)
 _log = logging.getLogger(__name__)
 
@@ -64,7 +71,7 @@ class Spec:
 
 
 def parse(text: str) -> Spec:
-    """`udpout:HOST:PORT`, `udpin:HOST:PORT`, `tcp:HOST:PORT` or `serial:DEVICE:BAUD`.
+    """`udpout:HOST:PORT`, `udpin:HOST:PORT`, `tcp:HOST:PORT`, `tcpin:HOST:PORT` or `serial:DEVICE:BAUD`.
 
     Raises `LinkError` with one line that says what is wrong.
     """
@@ -96,6 +103,10 @@ class Link:
         self.dropped = 0
         """frames that did not go: link down, nobody to send to, or too much waiting"""
         self.received_bytes = 0
+        self.flooded_bytes = 0
+        """of them dropped unread, because too much came"""
+        self._allowance = float(BURST)
+        self._taken_s = -math.inf
         self.refused = 0
         """udpout: times that the other end said nobody listens there; normal while it starts"""
         self.last_error = ""
@@ -122,6 +133,13 @@ class Link:
     def take(self, data: bytes) -> None:
         """For the port: bytes have come."""
         self.received_bytes += len(data)
+        now_s = time.monotonic()
+        self._allowance = min(self._allowance + (now_s - self._taken_s) * BYTES_PER_S, BURST)
+        self._taken_s = now_s
+        if len(data) > self._allowance:
+            self.flooded_bytes += len(data)
+            return
+        self._allowance -= len(data)
         self._on_bytes(data)
 
     async def run(self) -> None:
@@ -233,6 +251,58 @@ class _Stream(_Port, asyncio.Protocol):
         return True
 
 
+class _TcpIn(_Port):
+    """Listens; one client at a time, the latest: who connects again has lost the connection before."""
+
+    server: asyncio.Server
+
+    def __init__(self, link: Link) -> None:
+        super().__init__(link)
+        self._client: _Accepted | None = None
+
+    @property
+    def ready(self) -> bool:
+        return self._client is not None and self._client.ready
+
+    def accept(self, client: _Accepted) -> None:
+        if self._client is not None:
+            self._client.abort()
+        self._client = client
+
+    def lose(self, client: _Accepted) -> None:
+        if self._client is client:
+            self._client = None
+        if self._client is None and not self.server.is_serving():
+            self.connection_lost(None)
+
+    def write(self, frame: bytes) -> bool:
+        return self._client is not None and self._client.write(frame)
+
+    def abort(self) -> None:
+        self.server.close()
+        if self._client is None:
+            self.connection_lost(None)
+        else:
+            self._client.abort()
+
+
+class _Accepted(_Stream):
+    """A client of ours."""
+
+    def __init__(self, listener: _TcpIn) -> None:
+        super().__init__(listener.link)
+        self._listener = listener
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        _bound_waiting(transport)
+        self._listener.accept(self)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        super().connection_lost(error)
+        self._listener.lose(self)
+
+
 class _UdpOut(_Port, asyncio.DatagramProtocol):
     """A connected UDP socket: it hears of ICMP errors, and only its peer can answer."""
 
@@ -318,11 +388,25 @@ async def _open_udpin(link: Link) -> _Port:
 async def _open_tcp(link: Link) -> _Port:
     loop = asyncio.get_running_loop()
     transport, port = await loop.create_connection(lambda: _Stream(link), link.spec.target, link.spec.number)
+    _bound_waiting(transport)
+    return port
+
+
+async def _open_tcpin(link: Link) -> _Port:
+    port = _TcpIn(link)
+    loop = asyncio.get_running_loop()
+    port.server = await loop.create_server(
+        lambda: _Accepted(port), link.spec.target, link.spec.number, backlog=1
+    )
+    return port
+
+
+def _bound_waiting(transport: asyncio.BaseTransport) -> None:
+    """Little may wait in the kernel, and not for long."""
     connection = transport.get_extra_info("socket")
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BUFFER)
     if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, PEER_GONE_MS)
-    return port
 
 
 async def _open_serial(link: Link) -> _Port:
@@ -338,5 +422,11 @@ async def _open_serial(link: Link) -> _Port:
 
 
 OPENERS: Mapping[str, Callable[[Link], Awaitable[_Port]]] = MappingProxyType(
-    {"udpout": _open_udpout, "udpin": _open_udpin, "tcp": _open_tcp, "serial": _open_serial}
+    {
+        "udpout": _open_udpout,
+        "udpin": _open_udpin,
+        "tcp": _open_tcp,
+        "tcpin": _open_tcpin,
+        "serial": _open_serial,
+    }
 )

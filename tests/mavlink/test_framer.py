@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 from itertools import pairwise
+from pathlib import Path
 
+from conftest import ROOT
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
@@ -147,6 +151,28 @@ def test_an_unknown_message_is_passed_over() -> None:
     assert framer.skipped == len(unknown)
 
 
+def test_what_another_message_carries_is_no_frame() -> None:
+    """A log on its way through the autopilot may hold a whole heartbeat: it was never said on this wire."""
+    mav = common.MAVLink(None, 7, 1)
+    (heartbeat,) = frames(1)
+    carrier = bytes(common.MAVLink_log_data_message(1, 0, 90, heartbeat.ljust(90, b"\0")).pack(mav))
+    assert heartbeat in carrier
+    framer = Framer()
+    assert raws(framer.feed(carrier + heartbeat)) == [heartbeat]
+    assert (framer.frames, framer.others, framer.skipped) == (1, 1, len(carrier))
+
+
+def test_all_that_an_autopilot_says_is_told_from_noise() -> None:
+    framer = Framer()
+    mav = common.MAVLink(None, 7, 1)
+    for id, kind in common.mavlink_map.items():
+        message = kind.__new__(kind)
+        common.MAVLink_message.__init__(message, id, kind.msgname)
+        framer.feed(bytes(message._pack(mav, kind.crc_extra, bytes(range(1, kind.unpacker.size + 1)))))
+    assert framer.frames + framer.others == len(common.mavlink_map)
+    assert framer.bad_crc == 0
+
+
 def test_an_unknown_id_does_not_make_it_wait() -> None:
     """Eleven bytes of noise that announce 255 more must not hold back a heartbeat for seconds."""
     (heartbeat,) = frames(1)
@@ -185,3 +211,17 @@ def test_counters_add_up() -> None:
     assert framer.frames == 2
     assert framer.bad_crc >= 1
     assert framer.skipped == len(broken) + 5
+
+
+def test_damaged_frames_by_the_thousand_neither_raise_nor_pile_up() -> None:
+    """A short run of what the night runs by the ten million, in a process whose size is measured."""
+    script = Path(__file__).parent / "fuzz.py"
+    done = subprocess.run(
+        [sys.executable, str(script), "--inputs", "60000", "--seed", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "no exception" in done.stdout

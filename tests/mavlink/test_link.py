@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from locagen_edge.errors import LinkError
 from locagen_edge.mavlink import link as road
@@ -90,6 +92,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
         ("udpout:127.0.0.1:14550", Spec("udpout", "127.0.0.1", 14550)),
         ("udpin:0.0.0.0:14550", Spec("udpin", "0.0.0.0", 14550)),
         ("tcp:ground.local:5760", Spec("tcp", "ground.local", 5760)),
+        ("tcpin:0.0.0.0:5760", Spec("tcpin", "0.0.0.0", 5760)),
         ("serial:/dev/ttyAMA0:921600", Spec("serial", "/dev/ttyAMA0", 921600)),
         (
             "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0:57600",
@@ -98,7 +101,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
     ],
 )
 def test_a_link_is_read_and_shown_as_the_settings_write_it(text: str, spec: Spec) -> None:
-    Settings(mavlink=MavlinkSettings(link=text))
+    Settings(mavlink=MavlinkSettings(link=(text,)))
     assert parse(text) == spec
     assert str(spec) == text
 
@@ -106,7 +109,7 @@ def test_a_link_is_read_and_shown_as_the_settings_write_it(text: str, spec: Spec
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "begins with none of udpout, udpin, tcp, serial"),
+        ("", "begins with none of udpout, udpin, tcp, tcpin, serial"),
         ("udp:127.0.0.1:14550", "begins with none of"),
         ("udpout", "is not udpout:NAME:NUMBER"),
         ("udpout::14550", "is not udpout:NAME:NUMBER"),
@@ -427,6 +430,80 @@ def test_a_peer_that_does_not_read_costs_frames_and_no_time() -> None:
         await server.close()
 
     run(test)
+
+
+def test_tcpin_lets_one_connect_and_the_latest_wins() -> None:
+    async def test() -> None:
+        port = free_port(socket.SOCK_STREAM)
+        async with running(f"tcpin:127.0.0.1:{port}") as (link, received):
+            await until(lambda: link._port)
+            assert not link.up, "nobody to send to"
+            assert not link.send(FRAME)
+            for visit in range(3):
+                reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.write(b"hello")
+                await until(lambda: received == b"hello")
+                received.clear()
+                assert link.up
+                assert link.send(FRAME)
+                async with asyncio.timeout(WITHIN_S):
+                    assert await reader.readexactly(len(FRAME)) == FRAME
+                    if visit == 0:  # a second one while the first is there
+                        late, later = await asyncio.open_connection("127.0.0.1", port)
+                        assert await reader.read() == b"", "the first one is let go"
+                        later.write(b"here")
+                        await until(lambda: received == b"here")
+                        received.clear()
+                        assert link.send(FRAME)
+                        assert await late.readexactly(len(FRAME)) == FRAME
+                        later.close()
+                writer.close()
+                await until(lambda: not link.up)
+            assert link.reopened == 0
+
+    run(test)
+
+
+def test_tcpin_on_a_taken_port_says_so_and_gets_it_later(caplog: pytest.LogCaptureFixture) -> None:
+    async def test() -> None:
+        server = Server(free_port(socket.SOCK_STREAM))
+        await server.open()
+        async with running(f"tcpin:127.0.0.1:{server.port}") as (link, _):
+            await until(lambda: link.last_error)
+            assert "in use" in link.last_error
+            await server.close()
+            await until(lambda: link._port)
+
+    run(test)
+    assert len(lines(caplog)) == 1
+
+
+# --- a flood ------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.tuples(st.floats(0, 3), st.integers(1, 200_000)), max_size=60))
+def test_of_a_flood_only_so_much_is_read(arrivals: list[tuple[float, int]]) -> None:
+    """In any span no more than BURST and BYTES_PER_S over it; the rest is counted; calm is never cut."""
+    now_s, taken, read = 100.0, 0, []
+
+    def clock() -> float:
+        return now_s
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(road.time, "monotonic", clock)
+        link = Link(Spec("udpin", "", 1), backoff_s=1.0, on_bytes=lambda d: read.append((now_s, len(d))))
+        for pause_s, size in arrivals:
+            now_s += pause_s
+            link.take(bytes(size))
+            taken += size
+    assert sum(size for _, size in read) + link.flooded_bytes == link.received_bytes == taken
+    for first, (begin_s, _) in enumerate(read):
+        total = 0
+        for t_s, size in read[first:]:
+            total += size
+            assert total <= road.BURST + road.BYTES_PER_S * (t_s - begin_s) + 1e-3
+    if all(size <= pause_s * road.BYTES_PER_S for pause_s, size in arrivals):
+        assert link.flooded_bytes == 0
 
 
 # --- serial -------------------------------------------------------------------------------------------
