@@ -190,6 +190,10 @@ class SteeredLocator:
             span_s=self._spans_s[span],
         )
 
+    def scores(self, bearing: Bearing) -> tuple[F32, F32]:
+        """What a bearing of this very frame was taken from: azimuths (columns,) and scores (rows, columns)."""
+        return self._search.azimuth_rad, self._search.map(self._spans_s.index(bearing.span_s))
+
     def settle(self, call: bool, /) -> None:
         """Whether the frame was taken for a call: if not, it is noise to learn from, once `LAG_S` has shown
         that no call began in it; so a caller too faint to be detected is learnt too, and fades within
