@@ -52,33 +52,48 @@ SIGMAS = (1.0, 2.0)
 
 @dataclass(frozen=True)
 class Kind:
-    """A disturbance: what differs in [twin] and [scene], and a second caller's level."""
+    """A disturbance: what differs in [scene] and [twin], in turns of `CHUNK` calls where it is a list, and a
+    second caller's level."""
 
-    twin: dict[str, Any] = dataclasses.field(default_factory=dict)
     scene: dict[str, Any] = dataclasses.field(default_factory=dict)
+    twin: dict[str, Any] = dataclasses.field(default_factory=dict)
     second_db: float | None = None
 
+    def turn(self, number: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Of [scene] and [twin]."""
+        scene, twin = (
+            {k: v[number % len(v)] if isinstance(v, list) else v for k, v in keys.items()}
+            for keys in (self.scene, self.twin)
+        )
+        return scene, PLACES[number // 2 % len(PLACES)] | twin
+
+
+CHUNK = 25
+PLACES: tuple[dict[str, Any], ...] = (
+    {"range_m": 60.0, "height_m": 5.0, "height_span_m": 55.0},
+    {"range_m": 15.0, "height_m": 2.0, "height_span_m": 4.0},
+    {"range_m": 30.0, "height_m": 5.0, "height_span_m": 15.0},
+)
+"""Where callers are, in turns as well: far, near, between."""
 
 KINDS: dict[str, Kind] = {
     "free field": Kind(),
-    "ground": Kind(scene={"ground": 0.7}),
-    "wind": Kind(scene={"wind_m_s": 8.0, "wind_dbfs": -10.0}),
-    "clipping": Kind(scene={"level_dbfs": 6.0}),
+    "ground": Kind({"ground": [0.4, 0.8]}),
+    "wind": Kind({"wind_m_s": 8.0, "wind_dbfs": -10.0}),
+    "clipping": Kind({"level_dbfs": [0.0, 6.0]}),
     "positions 1 mm": Kind(twin={"position_error_m": 0.001 * math.sqrt(3.0)}),
     "two callers": Kind(second_db=-6.0),
-    "rotors": Kind(scene={"rotors": 4, "rotor_snr_db": 0.0}),
+    "rotors": Kind({"rotors": 4, "rotor_snr_db": [0.0, 10.0]}),
 }
 """All with the tolerance of the settings in the microphones' places, but for the one that has more."""
 
+HOVER = {"range_m": 20.0, "height_m": 10.0, "height_span_m": 2.0}
 ELSEWHERE: dict[str, Kind] = {
-    "free field, nearby": Kind(twin={"range_m": 15.0, "height_m": 2.0, "height_span_m": 4.0}),
-    "ground, nearby": Kind(
-        twin={"range_m": 15.0, "height_m": 2.0, "height_span_m": 4.0}, scene={"ground": 0.7}
-    ),
-    "ground, right below": Kind(
-        twin={"range_m": 15.0, "height_m": 25.0, "height_span_m": 15.0}, scene={"ground": 0.7}
-    ),
-    "ground, grazing": Kind(scene={"ground": -0.7}),
+    "free field, 10 m high": Kind(twin=HOVER),
+    "ground, 10 m high": Kind({"ground": 0.6}, HOVER),
+    "ground, caller lying": Kind({"ground": 0.6, "mouth_m": 0.3}),
+    "ground, negative": Kind({"ground": -0.6}),
+    "ground and rotors": Kind({"ground": 0.6, "rotors": 4, "rotor_snr_db": 5.0}),
 }
 """Never trained on, by anyone: other places and another ground, where what was learnt of the twin's own
 places, and is no physics, does harm."""
@@ -132,16 +147,17 @@ def features(azimuth_axis: F32, scores: F32, bearing: Bearing) -> F32:
     return np.concatenate([turned.ravel(), told]).astype(np.float32)
 
 
-def under(s: LabSettings, kind: Kind) -> LabSettings:
-    """The settings of the disturbance's scenes."""
+def under(s: LabSettings, kind: Kind, number: int) -> LabSettings:
+    """The settings of the disturbance's scenes, in their turn."""
+    changed, places = kind.turn(number)
     lead = math.ceil(LEAD_S / s.hop_s)
     twin: dict[str, Any] = {
-        "source": "disc", "range_m": 60.0, "height_m": 5.0, "height_span_m": 55.0, "noise": "snr",
-        "snr_db": 0.0, "position_error_m": s.array.tolerance_m * math.sqrt(3.0), **kind.twin,
+        "source": "disc", "noise": "snr", "snr_db": 0.0,
+        "position_error_m": s.array.tolerance_m * math.sqrt(3.0), **places,
     }  # fmt: skip
     scene: dict[str, Any] = {
         "sounds": ("white", "speech", "scream"), "frames": lead + CALL_FRAMES,
-        "lead_s": lead * s.hop_s, "snr_span_db": 30.0, **kind.scene,
+        "lead_s": lead * s.hop_s, "snr_span_db": 30.0, **changed,
     }  # fmt: skip
     return dataclasses.replace(
         s,
@@ -153,16 +169,15 @@ def under(s: LabSettings, kind: Kind) -> LabSettings:
 
 def calls(s: LabSettings, kind: Kind, count: int, seed: int, taken: tuple[int, ...], workers: int) -> Calls:
     """`count` calls under a disturbance as the estimator hears them, each with a past of its own."""
-    chunk = 50
     pieces = Parallel(n_jobs=workers)(
-        delayed(_some)(s, kind, min(chunk, count - first), seed, first, taken)
-        for first in range(0, count, chunk)
+        delayed(_some)(s, kind, min(CHUNK, count - first), seed, first, taken)
+        for first in range(0, count, CHUNK)
     )
     return joined(pieces)
 
 
 def _some(s: LabSettings, kind: Kind, count: int, seed: int, first: int, taken: tuple[int, ...]) -> Calls:
-    here = under(s, kind)
+    here = under(s, kind, first // CHUNK)
     drawn = waveforms(here, count, seed, first)
     sound = drawn.sound
     if kind.second_db is not None:
