@@ -404,3 +404,35 @@ def _of(told: dict[str, Any] | None, key: str) -> str:
 
 def _within(told: dict[str, Any] | None) -> str:
     return " / ".join(f"{share:.0%}" for share in told["within"]) if told else "-"
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The report, from its numbers alone."""
+    counts = result["calls"]
+    return "\n".join([
+        "# The steered estimator and a network behind it",
+        "",
+        f"{result['parameters']:,} parameters, trained on {counts['trained_on']} calls of each of "
+        f"{len(KINDS)} disturbances, judged on {counts['judged']} others of each and on scenes of which none "
+        "were trained on (`-`). *Never met*: the network that was trained without that disturbance. *Change*: "
+        "of the median error, 95 % by bootstrap over the same calls; `better` and `worse` where it leaves "
+        "zero out. Right sigmas hold 68 % / 95 %.",
+        "",
+        "## Azimuth",
+        "",
+        table(result, "azimuth"),
+        "",
+        "## Elevation",
+        "",
+        table(result, "elevation"),
+        "",
+    ])  # fmt: skip
+
+
+def line(result: dict[str, Any]) -> str:
+    """The result in one line."""
+    words = []
+    for angle in ("azimuth", "elevation"):
+        verdicts = [row[angle]["refined"]["verdict"] for row in result["rows"]]
+        words.append(f"{angle} better in {verdicts.count('better')}, worse in {verdicts.count('worse')}")
+    return f"of {len(result['rows'])} kinds of scenes: " + "; ".join(words)

@@ -21,16 +21,16 @@ def add_command(subparsers: Any) -> None:
         help="a network that corrects the steered estimator, judged beside it",
         description="Train a network on the score maps of the estimator `steered` under the twin's "
         "disturbances, and judge it beside the estimator on calls of other seeds and on disturbances that it "
-        "has not met. Writes report.md, report.json. Takes some ten minutes.",
+        "has not met. Writes report.md, report.json. Takes some minutes.",
     )
     parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML file (default: built in)")
     parser.add_argument("--out", type=Path, default=Path("refine-report"), metavar="DIR",
                         help="where to write (default: refine-report)")  # fmt: skip
     parser.add_argument(
-        "--calls", type=int, default=1500, help="calls of each kind to learn from (default 1500)"
+        "--calls", type=int, default=1000, help="calls of each kind to learn from (default 1000)"
     )
     parser.add_argument(
-        "--judged", type=int, default=400, help="calls of each kind to judge by (default 400)"
+        "--judged", type=int, default=300, help="calls of each kind to judge by (default 300)"
     )
     parser.add_argument("--workers", type=int, default=1, help="processes that make calls (default 1)")
     parser.set_defaults(command=run)
