@@ -87,7 +87,8 @@ def test_calls_are_of_their_seed_and_a_free_field_is_found_within_its_sigmas() -
     )
     np.testing.assert_array_equal(some.x, again.x)
     assert not np.array_equal(some.off, others.off)
-    assert some.offered == 12 and len(some.x) >= 10
+    assert some.offered == 12
+    assert len(some.x) >= 10
     assert np.median(np.abs(some.off[:, 0]) / some.sigma[:, 0]) < 1.5
 
 

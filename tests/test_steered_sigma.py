@@ -16,7 +16,7 @@ ARRAYS = 60
 
 @pytest.mark.parametrize("elevation_deg", [-60.0, -20.0])
 def test_misplaced_microphones_turn_the_bearing_by_as_much_as_it_says(elevation_deg: float) -> None:
-    """A loud plane wave in hardly any noise: nothing but the positions, off by N(0, tolerance_m), is wrong."""
+    """A loud plane wave in hardly any noise: only the positions, off by N(0, tolerance_m), are wrong."""
     s = Settings()
     rate_hz, n, tolerance_m = s.audio.rate_hz, s.audio.frame, s.array.tolerance_m
     rng = np.random.default_rng(1)
@@ -36,7 +36,8 @@ def test_misplaced_microphones_turn_the_bearing_by_as_much_as_it_says(elevation_
             frame = Frame(sound.astype(np.float32), rate_hz, 0, number * s.audio.hop)
             bearing = locate(frame, NO_DELAYS, s.hop_s)[0]
             locate.settle(number == looks)
-        assert bearing.azimuth_rad is not None and bearing.elevation_rad is not None
+        assert bearing.azimuth_rad is not None
+        assert bearing.elevation_rad is not None
         share.append((
             wrap(bearing.azimuth_rad - azimuth) / bearing.azimuth_sigma_rad,
             (bearing.elevation_rad - elevation) / bearing.elevation_sigma_rad,

@@ -1,13 +1,13 @@
 """Can a network correct the steered estimator where physics is not the free field?
 
-The estimator `steered` is the best possible for one plane wave in known noise. Echoes, clipping, wind, rotors,
-misplaced microphones and a second caller are not in its model, but they leave a mark in its score map. A
+The estimator `steered` is the best possible for one plane wave in known noise. Echoes, clipping, wind,
+rotors, misplaced microphones and a second caller are not in its model, but may leave a mark in its map. A
 network sees that map, turned so that the estimate is in the middle, with the estimate's elevation, sigmas and
 score, and answers with a correction of azimuth and elevation and with new sigmas, all in units of the
 estimator's own sigmas: in the free field "nothing to do" is zero.
 
-It is judged against the estimator on the same calls, on seeds not trained on and, by a network that is trained
-without it, on each kind of disturbance as one never met. Loss: the Gaussian's negative log-likelihood with
+It is judged against the estimator on the same calls, on seeds not trained on and, by a network that is
+trained without it, on each kind of disturbance as one never met. Loss: the Gaussian's negative log-likelihood with
 mean and variance both learnt (Nix & Weigend, "Estimating the mean and variance of the target probability
 distribution", ICNN 1994).
 """
@@ -131,7 +131,8 @@ def joined(parts: Iterable[Calls]) -> Calls:
 
 def features(azimuth_axis: F32, scores: F32, bearing: Bearing) -> F32:
     """(rows * columns + 6,): the map over its top, the estimate in its middle column, and the estimate."""
-    assert bearing.azimuth_rad is not None and bearing.elevation_rad is not None
+    assert bearing.azimuth_rad is not None
+    assert bearing.elevation_rad is not None
     columns = scores.shape[1]
     top = max(float(scores.max()), 1e-6)
     at = (bearing.azimuth_rad - float(azimuth_axis[0])) * columns / (2.0 * math.pi)
@@ -192,7 +193,8 @@ def _some(s: LabSettings, kind: Kind, count: int, seed: int, first: int, taken: 
     x, off, sigma = [], [], []
     for samples, azimuth, elevation in zip(sound, drawn.azimuth_rad, drawn.elevation_rad, strict=True):
         for row, bearing in _heard(here, samples, taken):
-            assert bearing.azimuth_rad is not None and bearing.elevation_rad is not None
+            assert bearing.azimuth_rad is not None
+            assert bearing.elevation_rad is not None
             x.append(row)
             off.append((wrap(float(azimuth) - bearing.azimuth_rad), float(elevation) - bearing.elevation_rad))
             sigma.append((bearing.azimuth_sigma_rad, bearing.elevation_sigma_rad))
@@ -234,6 +236,11 @@ class Refiner(torch.nn.Module):
     """Features (n, features) to (n, 4): corrections of azimuth and elevation, and the logs of their sigmas,
     in units of the estimator's own sigmas."""
 
+    mean: torch.Tensor
+    scale: torch.Tensor
+    wider: torch.Tensor
+    """(4,) added to the answer: by what the sigmas are widened in the end"""
+
     def __init__(self, x: F32) -> None:
         super().__init__()
         # cells that never change would blow up what is strange in flight
@@ -241,14 +248,13 @@ class Refiner(torch.nn.Module):
         self.register_buffer("scale", torch.from_numpy(1.0 / np.maximum(x.std(axis=0), 0.05)))
         self.register_buffer("wider", torch.zeros(4))
         first, second = WIDTHS
+        last = torch.nn.Linear(second, 4)
         self.body = torch.nn.Sequential(
             torch.nn.Linear(x.shape[1], first), torch.nn.Tanh(),
-            torch.nn.Linear(first, second), torch.nn.Tanh(),
-            torch.nn.Linear(second, 4),
+            torch.nn.Linear(first, second), torch.nn.Tanh(), last,
         )  # fmt: skip
-        with torch.no_grad():
-            self.body[-1].weight.zero_()  # begins as the estimator itself
-            self.body[-1].bias.zero_()
+        torch.nn.init.zeros_(last.weight)  # begins as the estimator itself
+        torch.nn.init.zeros_(last.bias)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         y: torch.Tensor = self.body(torch.clamp((x - self.mean) * self.scale, -8.0, 8.0))
@@ -344,8 +350,7 @@ def _row(name: str, judged: Calls, answers: dict[str, Calls]) -> dict[str, Any]:
     row: dict[str, Any] = {"kind": name, "n": len(judged.x), "heard": len(judged.x) / judged.offered}
     for axis, angle in enumerate(("azimuth", "elevation")):
         row[angle] = {
-            who: told(c.off[:, axis], c.sigma[:, axis])
-            for who, c in {"analytic": judged, **answers}.items()
+            who: told(c.off[:, axis], c.sigma[:, axis]) for who, c in {"analytic": judged, **answers}.items()
         }
         for who, c in answers.items():
             low, high = _interval(np.abs(judged.off[:, axis]), np.abs(c.off[:, axis]))
@@ -414,9 +419,9 @@ def markdown(result: dict[str, Any]) -> str:
         "",
         f"{result['parameters']:,} parameters, trained on {counts['trained_on']} calls of each of "
         f"{len(KINDS)} disturbances, judged on {counts['judged']} others of each and on scenes of which none "
-        "were trained on (`-`). *Never met*: the network that was trained without that disturbance. *Change*: "
-        "of the median error, 95 % by bootstrap over the same calls; `better` and `worse` where it leaves "
-        "zero out. Right sigmas hold 68 % / 95 %.",
+        "were trained on (`-`). *Never met*: the network that was trained without that disturbance. "
+        "*Change*: of the median error, 95 % by bootstrap over the same calls; `better` and `worse` where it "
+        "leaves zero out. Right sigmas hold 68 % / 95 %.",
         "",
         "## Azimuth",
         "",

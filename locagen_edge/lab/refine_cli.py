@@ -41,7 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
     settings = read(arguments.settings)
     for name in ("calls", "judged"):
         if getattr(arguments, name) < FEWEST:
-            raise SettingsError(f"--{name} {getattr(arguments, name)}: at least {FEWEST} of each kind are needed")
+            raise SettingsError(
+                f"--{name} {getattr(arguments, name)}: at least {FEWEST} of each kind are needed"
+            )
 
     from locagen_edge.lab import refine
 

@@ -206,7 +206,7 @@ class SteeredLocator:
         return scale * math.sqrt(seen[1, 1]) / level, scale * math.sqrt(seen[0, 0])
 
     def scores(self, bearing: Bearing) -> tuple[F32, F32]:
-        """What a bearing of this very frame was taken from: azimuths (columns,) and scores (rows, columns)."""
+        """What a bearing of this frame was taken from: azimuths (columns,) and scores (rows, columns)."""
         return self._search.azimuth_rad, self._search.map(self._spans_s.index(bearing.span_s))
 
     def settle(self, call: bool, /) -> None:
