@@ -2,10 +2,10 @@
 
     python bench/bench_detection.py [--minutes N] [--trials N] [--quick] [--output FILE]
 
-The pipeline as it flies, with the default settings. Noise alone: streams of 5 minutes, of which the first 10 s (of
-learning) are told apart; a false call is one that begins. Calls: one of 1 s, after 14 s of noise, found when a
-frame of it is taken for a call; the onset as told with the last such frame; the bearing that of the last frame of
-the call with one; sigma: share of the bearings in calls within 1 and 2 of their sigmas.
+The pipeline as it flies, with the default settings. Noise alone: streams of 5 minutes, of which the first 10 s
+(of learning) are told apart; a false call is one that begins. Calls: one of 1 s, after 14 s of noise, found
+when a frame of it is taken for a call; the onset as told with the last such frame; the bearing that of the
+last frame of the call with one; sigma: share of the bearings in calls within 1 and 2 of their sigmas.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from locagen_edge.geometry import direction, wrap
 from locagen_edge.pipeline import Pipeline
-from locagen_edge.settings import from_table
+from locagen_edge.settings import Settings, from_table
 from locagen_edge.sim.calls import CALLS
 from locagen_edge.sim.propagation import plane_wave
 from locagen_edge.types import F64, Estimate, Frame
@@ -36,12 +36,12 @@ CALL_AT_S, CALL_S, AFTER_S = 14.0, 1.0, 2.0
 FADE = round(0.01 * RATE)
 KINDS = ("scream", "speech", "whistle")
 SNRS_DB = (-5, -10, -15, -20)
-DEFAULT = from_table({})
+DEFAULT: Settings = from_table({})
 
 
 def estimates(sound: F64, positions: F64) -> Iterator[tuple[float, Estimate]]:
     """Time of each frame's end, and what the pipeline says."""
-    settings = from_table({"array": {"positions_m": positions.tolist()}})
+    settings: Settings = from_table({"array": {"positions_m": positions.tolist()}})
     pipeline, audio = Pipeline(settings), settings.audio
     samples = (0.02 * sound).astype(np.float32)
     for start in range(0, samples.shape[1] - audio.frame + 1, audio.hop):
@@ -127,9 +127,7 @@ def calls(name: str, kind: str, snr_db: float, trials: int, usual: F64) -> dict[
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--minutes", type=float, default=60.0, help="of each kind of noise alone (default 60)"
-    )
+    parser.add_argument("--minutes", type=float, default=60.0, help="of each noise alone (default 60)")
     parser.add_argument("--trials", type=int, default=40, help="calls of each kind and SNR (default 40)")
     parser.add_argument("--quick", action="store_true", help="half a minute and 2 trials, simulated only")
     parser.add_argument("--output", type=Path, default=report.default("detection"))

@@ -1,7 +1,7 @@
 """Rotor noise of every kind at an array, for the benchmarks: simulated, hunting, and recorded.
 
-Each maker gives (mics, samples) at the processing rate with an in-band power of 1 per microphone. The recorded
-kinds need the folder of recorded sounds, from LOCAGEN_RECORDINGS or beside the project.
+Each maker gives (mics, samples) at the processing rate with an in-band power of 1 per microphone. The
+recorded kinds need the folder of recorded sounds, from LOCAGEN_RECORDINGS or beside the project.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def _endless(sound: F64, samples: int, rng: np.random.Generator) -> F64:
     return out[:, begin : begin + samples]
 
 
-def four_microphones(seconds: float, positions: F64, number: int, rng: np.random.Generator) -> F64:
+def four_microphones(seconds: float, _: F64, __: int, rng: np.random.Generator) -> F64:
     """Recorded on a flying frame: four propellers, each from a file of its own, three of four microphones."""
     folder = recordings()
     assert folder is not None
