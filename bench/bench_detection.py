@@ -2,10 +2,10 @@
 
     python bench/bench_detection.py [--minutes N] [--trials N] [--quick] [--output FILE]
 
-The pipeline as it flies, with the default settings. Noise alone: streams of 5 minutes, of which the first 10 s
-(of learning) are told apart; a false call is one that begins. Calls: one of 1 s, after 14 s of noise, found
-when a frame of it is taken for a call; the onset as told with the last such frame; the bearing that of the
-last frame of the call with one; sigma: share of the bearings in calls within 1 and 2 of their sigmas.
+The pipeline as it flies, with the default settings. Noise alone: streams of 5 minutes, of which the first
+10 s (of learning) are told apart; a false call is one that begins. Calls: one of 1 s, after 14 s of noise,
+found when a frame of it is taken for a call; the onset as told with the last such frame; the bearing that of
+the last frame of the call with one; sigma: share of the bearings in calls within 1 and 2 of their sigmas.
 """
 
 from __future__ import annotations

@@ -185,10 +185,8 @@ int locagen_steer_watch(locagen_steer *state, int32_t span);
  * false-alarm rate. */
 int locagen_steer_settle(locagen_steer *state, int32_t span, float share);
 
-/* Instead of watch, while something may call: drops what was put aside, and of the last search keeps in mind
- * what lets nothing grow by more than the share `growth`: little of a call, but noise that is taken for calls
- * again and again ceases to be. */
-int locagen_steer_doubt(locagen_steer *state, int32_t span, float share, float growth);
+/* Instead of watch, while something calls: what was put aside is dropped. */
+int locagen_steer_doubt(locagen_steer *state, int32_t span);
 
 /* Weights 0 to 1 of all bins, for the searches to come: each bin counts as so many looks less. */
 int locagen_steer_weigh(locagen_steer *state, const float *weight);

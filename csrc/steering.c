@@ -576,7 +576,7 @@ int locagen_steer_settle(locagen_steer *memory, int32_t span, float share)
     return LOCAGEN_OK;
 }
 
-int locagen_steer_doubt(locagen_steer *memory, int32_t span, float share, float growth)
+int locagen_steer_doubt(locagen_steer *memory, int32_t span)
 {
     if (memory == NULL)
         return LOCAGEN_E_NULL;
@@ -584,20 +584,11 @@ int locagen_steer_doubt(locagen_steer *memory, int32_t span, float share, float 
     locagen_span *x = span_of(s, span);
     if (x == NULL)
         return LOCAGEN_E_SPAN;
-    if (!within((double)share, 0, 1) || !within((double)growth, 0, 1))
-        return LOCAGEN_E_SHARE;
     for (int i = 0; i < 2; i++)
         if (x->aside_count[i] > 0) {
             memset(x->aside[i], 0, (size_t)spread_count(s) * sizeof *x->aside[i]);
             x->aside_count[i] = 0;
         }
-    if (x->heard <= 0 || s->learnt <= 0 || share == 0)
-        return LOCAGEN_OK;
-    double prior = prior_of(s, x), total = x->watched + prior;
-    double most = 1 + (double)growth * (total + (double)share) / (double)share;
-    s->paths->blend_squares(spread_count(s), share, over_theory(s, x), (float)(most / total),
-                            (float)(most * prior / total), x->over, x->spread);
-    x->watched = (double)(1.0f - share) * x->watched + (double)share;
     return LOCAGEN_OK;
 }
 

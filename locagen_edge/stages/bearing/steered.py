@@ -36,8 +36,6 @@ LAG_S = 0.5
 """Noise is learnt so late: by then a call is known as one, and its beginning is not learnt."""
 MEANING = 1.6
 """Evidence from which a direction means something, though not yet a call."""
-GROWTH_S = 2.0
-"""Noise that is taken for calls ceases to be: what is kept in mind of it grows by e in this time at most."""
 WATCH_S = 15.0
 LOUDER = -0.5
 """Contrast over score below which all of the noise has become louder: about -2 where it has, 0 for a call."""
@@ -126,7 +124,8 @@ class SteeredLocator:
         if ratios[0] >= self._least_ratio:
             order = [0, *order]
         for span in order:
-            if not found[span]:
+            # between a loud caller's sounds an average only tells where he was
+            if not found[span] or (span > 0 and self._loud_hops_ago):
                 continue
             towards = self._nearest(found[span][0])
             # an average over a second remembers what has ended
@@ -212,17 +211,16 @@ class SteeredLocator:
 
     def _watch(self, call: bool) -> None:
         """What the noise's scores are, put aside until it is sure that they are the noise's."""
-        share = 1.0 - math.exp(-self._hop_s / WATCH_S)
         self._since_lag.append(max(self._ratios()))
         self._quiet_hops = 0 if call else self._quiet_hops + 1
+        quiet = self._quiet_hops * self._hop_s > PAUSE_S  # a call fades out, and its pauses are no noise
         for span in range(len(self._spans_s)):
-            if call:
-                self._search.doubt(share, self._hop_s / GROWTH_S, span)
-                continue
-            if not self._strange[span]:
+            if not quiet:
+                self._search.doubt(span)
+            elif not self._strange[span]:
                 self._search.watch(span)
-            if self._quiet_hops % self._lag == 0:
-                self._search.settle(share, span)
+            if quiet and self._quiet_hops % self._lag == 0:
+                self._search.settle(1.0 - math.exp(-self._hop_s / WATCH_S), span)
         for usual, score in zip(self._usual, self._scores, strict=True):
             usual.learn(score, self._elapsed_s)
         if not self._usual[0].young and max(self._since_lag) < self._least_ratio:
