@@ -56,6 +56,15 @@ class Detector:
         call = snr_db >= self._settings.snr_db and bearing.misfit <= self._settings.misfit
         return Detection(call=call, snr_db=snr_db, level_dbfs=10.0 * math.log10(level))
 
+    def apply(self, settings: DetectionSettings) -> None:
+        """New limits from the next frame on; the background stays."""
+        self._settings = settings
+
+    def forget(self) -> None:
+        """The next frame is all that is known of the background."""
+        self._smooth = None
+        self._minima.clear()
+
     def _follow(self, level: float, elapsed_s: float) -> float:
         """The background's power with this frame in it."""
         if self._smooth is None:

@@ -365,7 +365,10 @@ def test_texts_keep_their_distance_and_the_overflow_is_counted() -> None:
     component = Component(MavlinkSettings())
     flood = replace(QUIET, faults=tuple(f"fault {k}" for k in range(20)))
     told = [(t, m.text) for t, m in speak(component, flood, 10) if m.get_type() == "STATUSTEXT"]
-    assert [text for _, text in told] == [f"fault {k}" for k in range(voice.TEXTS_WAITING)]
+    assert [text for _, text in told] == [
+        *(f"fault {k}" for k in range(voice.TEXTS_WAITING)),
+        f"{20 - voice.TEXTS_WAITING} texts were left out: too many at once",
+    ]
     assert component.texts_dropped == 20 - voice.TEXTS_WAITING
     assert told[-1][0] >= (len(told) - 1) * voice.TEXT_S
 
@@ -376,7 +379,8 @@ def test_a_call_goes_before_faults_even_when_the_queue_is_full() -> None:
     component.due(0.0, replace(QUIET, faults=flood))
     told = texts(said(component, replace(CALLING, faults=(*flood, "one more")), 9, 0.1))
     assert told[0].startswith("Call heard")
-    assert told[1:] == [f"fault {k}" for k in range(1, voice.TEXTS_WAITING)], "the newest made room"
+    assert told[1:-1] == [f"fault {k}" for k in range(1, voice.TEXTS_WAITING)], "the newest made room"
+    assert told[-1] == f"{component.texts_dropped} texts were left out: too many at once"
     assert component.texts_dropped == 20 - voice.TEXTS_WAITING + 1
 
 
@@ -389,12 +393,20 @@ def test_when_the_link_comes_up_what_holds_is_told_again() -> None:
     assert len(first) == 2
 
 
-@given(st.text(max_size=120))
+@given(st.text(max_size=120) | st.text(min_size=95, max_size=260))
 def test_any_text_fits_and_stays_readable(words: str) -> None:
     frames = Component(MavlinkSettings()).due(0.0, replace(QUIET, faults=(words,)))
-    (text,) = texts(decode(frames))
-    assert len(text) == min(50, len(words))
+    chunks = [m for m in decode(frames) if m.get_type() == "STATUSTEXT"]
+    text = "".join(chunk.text for chunk in chunks)
+    assert len(text) == min(199, len(words))
     assert all(" " <= c <= "~" for c in text)
+    assert [chunk.chunk_seq for chunk in chunks] == list(range(len(chunks)))
+    assert len({chunk.id for chunk in chunks}) == 1
+    assert (chunks[0].id > 0) == (len(chunks) > 1) == (len(words) > 50), (
+        "a number only where there are chunks"
+    )
+    assert all(len(chunk.text) == 50 for chunk in chunks[:-1])
+    assert len(chunks) == 1 or len(chunks[-1].text) < 50, "what is not full ends it"
     assert all(a == b or b == "?" for a, b in zip(words, text, strict=False))
 
 
@@ -418,7 +430,7 @@ STATUSES = st.builds(
 
 
 @given(st.lists(STATUSES, max_size=30), st.binary(max_size=300))
-def test_only_four_messages_ever_leave(statuses: list[Status], noise: bytes) -> None:
+def test_only_five_messages_leave_unasked(statuses: list[Status], noise: bytes) -> None:
     component = Component(MavlinkSettings())
     ids: Counter[int] = Counter()
     for k, status in enumerate(statuses):
@@ -426,7 +438,7 @@ def test_only_four_messages_ever_leave(statuses: list[Status], noise: bytes) -> 
         messages = decode(component.due(k * 0.4, status))
         ids.update(m.get_msgId() for m in messages)
         assert all(m.command == 511 for m in messages if m.get_msgId() == 76)  # SET_MESSAGE_INTERVAL
-    assert set(ids) <= {0, 76, 251, 253}
+    assert set(ids) <= {0, 76, 111, 251, 253}
     assert sum(ids.values()) == sum(component.sent.values())
 
 

@@ -42,14 +42,24 @@ class SteeredLocator:
             smooth_bins=steered.smooth_bins,
             floor=10 ** (settings.correlation.floor_dbfs / 10),
         )
-        self._least_score = steered.score
-        self._share = 1.0 - math.exp(-settings.hop_s / steered.forget_s)
         # A microphone that fails for a moment must not be missing from the matrix for long after; one that
         # has failed for good must not keep the others from learning.
         self._bad_hops = 0
-        self._patience = steered.forget_s / settings.hop_s
-        self._to_learn = LOOKS * settings.mic_array.mics
+        self._looks = LOOKS * settings.mic_array.mics
+        self._to_learn = self._looks
         self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
+        self.apply(settings)
+
+    def apply(self, settings: Settings, /) -> None:
+        """Score and memory as these settings say; the noise's matrix stays."""
+        self._least_score = settings.steered.score
+        self._share = 1.0 - math.exp(-settings.hop_s / settings.steered.forget_s)
+        self._patience = settings.steered.forget_s / settings.hop_s
+
+    def forget(self) -> None:
+        """Begins anew with the noise's matrix."""
+        self._search.reset()
+        self._to_learn = self._looks
 
     def __call__(self, frame: Frame, _: Tdoa, /) -> Bearing:
         power, bad_mics = self._search.listen(frame.samples)
