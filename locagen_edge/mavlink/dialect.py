@@ -276,10 +276,13 @@ def command_at(
 
     In COMMAND_LONG a longitude would be a float32, good for some metres.
     """
-    frame = messages.MAV_FRAME_GLOBAL_RELATIVE_ALT if altitude_m is None else messages.MAV_FRAME_GLOBAL
+    if altitude_m is None or not abs(altitude_m) < 1e5:  # NaN too
+        altitude_m, frame = 0.0, messages.MAV_FRAME_GLOBAL_RELATIVE_ALT
+    else:
+        frame = messages.MAV_FRAME_GLOBAL
     lat, lon = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
     return messages.MAVLink_command_int_message(
-        system_id, COMPONENT_AUTOPILOT, frame, command, 0, 0, 0.0, 0.0, 0.0, 0.0, lat, lon, altitude_m or 0.0
+        system_id, COMPONENT_AUTOPILOT, frame, command, 0, 0, 0.0, 0.0, 0.0, 0.0, lat, lon, altitude_m
     )
 
 

@@ -173,7 +173,7 @@ class Parameters:
 
     def due(self, now_s: float) -> Iterator[tuple[int, Any]]:
         """Values of lists that go now, each with its link: a few at a time."""
-        room = min(math.floor((now_s - self._listed_s) * PER_S), 8) if self._lists else 0
+        room = math.floor(min((now_s - self._listed_s) * PER_S, 8.0)) if self._lists else 0
         if room < 1:
             return
         self._listed_s = now_s

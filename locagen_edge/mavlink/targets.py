@@ -65,13 +65,12 @@ def adsb_vehicle(place: Place) -> Any:
 def camera_target(place: Place, from_deg: tuple[float, float] | None = None) -> Any:
     """CAMERA_TRACKING_GEO_STATUS. `from_deg`: the vehicle's latitude and longitude, for the way."""
     distance, heading = _way(from_deg, place) if from_deg else (math.nan, math.nan)
-    known = place.altitude_m is not None
     return messages.MAVLink_camera_tracking_geo_status_message(
         tracking_status=messages.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE,
         lat=round(place.latitude_deg * 1e7),
         lon=round(place.longitude_deg * 1e7),
-        alt=place.altitude_m if known else math.nan,
-        h_acc=place.sigma_m,
+        alt=math.nan if place.altitude_m is None else _clamped(place.altitude_m),
+        h_acc=_clamped(place.sigma_m),
         v_acc=math.nan,
         vel_n=math.nan,
         vel_e=math.nan,
@@ -89,6 +88,11 @@ def _way(from_deg: tuple[float, float], place: Place) -> tuple[float, float]:
     east = math.radians((place.longitude_deg - from_deg[1] + 180.0) % 360.0 - 180.0)
     east *= math.cos(math.radians(from_deg[0]))
     return 6_371_000.0 * math.hypot(north, east), math.atan2(east, north)
+
+
+def _clamped(metres: float) -> float:
+    """Within what float32 holds; NaN stays NaN."""
+    return metres if math.isnan(metres) else min(max(metres, -1e9), 1e9)
 
 
 def _seconds(age_s: float) -> int:
