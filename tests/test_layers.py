@@ -70,6 +70,7 @@ ABOVE = {
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
     "notify": set(),
+    "mavproxy_locagen": GROUND | {"mavlink"},  # loaded by MAVProxy alone
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},
     "check": GROUND | {"stages", "mavlink", "pipeline", "sources"},

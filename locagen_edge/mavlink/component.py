@@ -65,6 +65,8 @@ CALLS_REMEMBERED = 16
 """tracks of which the operator was told; more than can be followed at a time"""
 TEXTS_WAITING = 8
 """texts that may wait, 4 s of them; beyond that the newest is dropped, counted, and the number told after"""
+REFUSED_S = 5.0
+"""the same refusal of a parameter is told once in this time"""
 PLACES_S = 1.0
 COMPUTER_S = 2.0
 """how often callers' places are told as traffic and as a target, and how the computer does"""
@@ -169,6 +171,7 @@ class Component:
         self.texts_dropped = 0
         """texts for which the queue had no room"""
         self._dropped_told = 0
+        self._refused = "", -math.inf
         self._text_number = 0
 
     @property
@@ -248,14 +251,15 @@ class Component:
         if self._is_ours(message):
             self._answer(link, *self.parameters.read(message))
 
-    def _hear_set(self, _: Packet, message: Any, link: int, __: float) -> None:
+    def _hear_set(self, _: Packet, message: Any, link: int, now_s: float) -> None:
         if not self._is_ours(message):
             return
         before = self.settings
         answers, fault = self.parameters.set(message)
         self._answer(link, *answers)
-        if fault:
+        if fault and (fault != self._refused[0] or now_s - self._refused[1] > REFUSED_S):
             self._say(dialect.SEVERITY_WARNING, fault)
+            self._refused = fault, now_s  # who is refused asks again, five times over
         if self.settings != before:
             self._follow_settings(before)
             self._hands.apply(self.settings)

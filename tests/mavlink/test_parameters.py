@@ -96,6 +96,14 @@ def test_a_type_that_is_not_float_is_refused() -> None:
     assert answers(component)[0].param_value == 4.0
 
 
+def test_who_asks_again_and_again_is_told_once() -> None:
+    component = Component(MavlinkSettings())
+    for k in range(6):
+        component.receive(setting("LG_TRK_COAST", 1e6), 0.5 * k)
+    assert len(answers(component)) == 6
+    assert texts(said(component, QUIET, 5)) == ["LG_TRK_COAST: 1000000.0 s is outside 0.1 to 600 s"]
+
+
 def test_only_our_own_ids_are_obeyed() -> None:
     component = Component(MavlinkSettings())
     for system, target in ((1, 1), (1, 0), (0, 191), (0, 0), (2, 191)):
