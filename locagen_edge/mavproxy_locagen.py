@@ -78,7 +78,7 @@ def ellipse(centre: Point, nn: float, ne: float, ee: float) -> list[Point]:
 
 
 def record_in(message: Any) -> tuple[Any, int] | None:
-    """The LOCAGEN message that a message of MAVProxy is or holds, and whose; None: there is none. Never raises.
+    """The LOCAGEN message that a message of MAVProxy is or holds, and whose; None: none. Never raises.
 
     MAVProxy does not know our ids: what they carry it hands on unread, unchecked, and without its sender.
     """

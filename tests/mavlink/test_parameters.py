@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
@@ -15,6 +16,7 @@ from test_component import QUIET, decode, said, texts
 
 from locagen_edge.errors import SettingsError
 from locagen_edge.mavlink import parameters
+from locagen_edge.mavlink.build_docs import with_tables
 from locagen_edge.mavlink.component import Component, Hands
 from locagen_edge.mavlink.parameters import (
     NAMES,
@@ -191,6 +193,14 @@ def test_the_rate_of_values_follows_at_once() -> None:
     component.receive(setting("LG_RATE", 5.0), 0.0)
     rates = [m for m in said(component, CALLING, 10) if m.get_type() == "NAMED_VALUE_FLOAT"]
     assert len([m for m in rates if m.name == "LG_AZB"]) == 50
+
+
+def test_the_tables_in_the_documentation_are_made_from_the_code() -> None:
+    document = (ROOT / "docs/mavlink.md").read_text(encoding="utf-8")
+    assert with_tables(document) == document, "make format"
+    assert all(f"`{name}`" in document for name in NAMES)
+    with pytest.raises(SystemExit, match="the document has no"):
+        with_tables("no marks")
 
 
 # --- kept over restarts -------------------------------------------------------------------------------
