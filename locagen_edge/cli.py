@@ -7,28 +7,48 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import io
 import json
 import logging
 import math
 import os
+import shutil
 import signal
 import statistics
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterator
+import time
+from collections import Counter, deque
+from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from locagen_edge import __version__
-from locagen_edge.errors import CalibrationError, LocagenError, SourceHungError
+from locagen_edge.errors import (
+    CalibrationError,
+    ExportError,
+    LocagenError,
+    SourceError,
+    SourceHungError,
+    StorageError,
+)
 from locagen_edge.geometry import compass_deg
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
-from locagen_edge.types import Estimate
+from locagen_edge.types import Estimate, Frame, Position, Track
 
 if TYPE_CHECKING:
     from locagen_edge.daemon import Daemon
+    from locagen_edge.export import Callers, Event
+    from locagen_edge.jsonl import Record
     from locagen_edge.mavlink.links import Links
+    from locagen_edge.store.recorder import Progress, Recorder
+
+EXPORT_S = 5.0
+"""How often `run --export` writes what is new."""
+EXPORT = "write callers whose place is known to a map file: .geojson, .kml or .gpx says the format"
+SERVICE_STATE = Path("/var/lib/locagen-edge")
+TYPES = ("start", "stop", "bearing", "call", "sighting", "fault", "link", "source", "losses", "lost")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -103,6 +123,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--seconds", type=_positive, metavar="N", help="stop after N seconds")
     run.add_argument("--quiet", action="store_true", help="no line per second (under a service manager)")
+    run.add_argument("--record", type=Path, metavar="DIR", help="keep the sound too, as `record` does")
+    run.add_argument("--export", type=Path, metavar="FILE", help=EXPORT)
 
     replay = command(
         "replay",
@@ -110,12 +132,71 @@ def _parser() -> argparse.ArgumentParser:
         "run a recording through the same pipeline, faster than real time",
         "One line per hop on standard output. t_s is the time of the frame's first sample; azimuth_deg is "
         "clockwise from ahead, 0 to 360; elevation_deg is positive up; sigma_deg is the azimuth's 1-sigma; "
-        "null means that nothing can be said. The estimate is given whether or not `call` is true. A call "
+        "null means that nothing can be said. The estimate is given whether or not `call` is true; `callers` "
+        "are all that are followed. A call "
         "stands out of the background: a sound that is there from the first frame to the last is none.",
     )
-    replay.add_argument("file", type=Path, metavar="FILE.wav", help="WAV or FLAC, any rate and channel count")
+    replay.add_argument(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="FILE.wav",
+        help="WAV or FLAC, any rate and channel count; several, or a folder of them, are one after another",
+    )
     replay.add_argument(
         "--format", choices=("jsonl", "table"), default="jsonl", help="JSON lines (default) or a table"
+    )
+
+    replay.add_argument("--export", type=Path, metavar="FILE", help=EXPORT)
+
+    record = command(
+        "record",
+        _record,
+        "keep all channels of the source on disk, in parts, as they come",
+        "Parts are WAV with the device's rate and channels; beside each are its settings and how the sound "
+        "came, so that `replay DIR` gives the bearings of the day. What a loss of power leaves behind is "
+        "mended by the next start in the same folder. Bounds are in the settings under [record]. SIGINT or "
+        "SIGTERM ends it.",
+    )
+    record.add_argument(
+        "--output", type=Path, metavar="DIR", help="where the parts go (default: record.directory)"
+    )
+    record.add_argument("--seconds", type=_positive, metavar="N", help="stop after N seconds of sound")
+
+    log = command(
+        "log",
+        _log,
+        "print the black box of `run`: calls, faults, links, losses, and on request every bearing",
+        "A record that a loss of power has torn is passed over.",
+    )
+    log.add_argument(
+        "directory",
+        type=Path,
+        nargs="?",
+        metavar="DIR",
+        help=f"where it is (default: log.directory, else {SERVICE_STATE})",
+    )
+    log.add_argument(
+        "--type", action="append", default=[], choices=TYPES, help="only these; more than once for several"
+    )
+    log.add_argument("--since", type=_moment, metavar="TIME", help="not older: ISO 8601, in UTC")
+    log.add_argument("--last", type=_count, metavar="N", help="the last N lines")
+    log.add_argument(
+        "--format", choices=("table", "jsonl"), default="table", help="a table (default) or the records"
+    )
+
+    fuse = command(
+        "fuse",
+        _fuse,
+        "find callers on the map from the sightings of one or several vehicles",
+        "Reads the black boxes of `run`, or JSON lines of one sighting each, and prints one line per caller: "
+        "place, 1-sigma ellipse, and which vehicles saw it. With -o also a map file.",
+    )
+    fuse.add_argument(
+        "files", type=Path, nargs="+", metavar="FILE", help="sightings (.jsonl), or the folder of a black box"
+    )
+    fuse.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="map file: .geojson, .kml or .gpx says the format"
     )
 
     command(
@@ -195,6 +276,20 @@ def _positive(text: str) -> float:
     return value
 
 
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
+    return int(text)
+
+
+def _moment(text: str) -> datetime:
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time like 2026-07-01T12:00") from None
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+
+
 def _settings(arguments: argparse.Namespace) -> Settings:
     if arguments.settings is not None:
         return load(arguments.settings)
@@ -206,16 +301,60 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 def _run(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
-    asyncio.run(_serve(settings, arguments.seconds, quiet=arguments.quiet))
+    callers, recorder = _callers(arguments), None
+    with contextlib.ExitStack() as ending:
+        if callers is not None:
+            ending.callback(_export_news, callers)
+        if arguments.record is not None:
+            from locagen_edge.store.recorder import Recorder
+
+            recorder = Recorder(arguments.record, settings)
+            ending.callback(recorder.close)
+        asyncio.run(_serve(settings, arguments.seconds, recorder, callers, quiet=arguments.quiet))
     return 0
 
 
-async def _serve(settings: Settings, seconds: float | None, *, quiet: bool) -> None:
+async def _serve(
+    settings: Settings,
+    seconds: float | None,
+    recorder: Recorder | None,
+    callers: Callers | None,
+    *,
+    quiet: bool,
+) -> None:
     from locagen_edge.daemon import Daemon
+    from locagen_edge.poses import record_of
+    from locagen_edge.sources import open_source
 
-    live = LiveLine()
-    daemon = Daemon(settings, on_second=None if quiet else live)
     loop = asyncio.get_running_loop()
+    live = LiveLine()
+    told: list[str] = []
+    export_s = 0.0
+
+    def each_estimate(frame: Frame, estimate: Estimate) -> None:
+        if recorder is not None and estimate.pose is not None:
+            recorder.note(record_of(estimate.pose))
+        if callers is not None:
+            callers.hear(estimate, _utc_ns(frame))
+
+    def each_second(daemon: Daemon) -> None:
+        nonlocal export_s
+        if callers is not None and callers.changed and loop.time() >= export_s:
+            export_s = loop.time() + EXPORT_S
+            callers.changed = False
+            loop.run_in_executor(None, _export_or_tell, callers, callers.events)
+        if not quiet:
+            live(daemon)
+        if recorder is not None and recorder.failure and not told:
+            told.append(recorder.failure)
+            logging.error("%s; bearings go on", recorder.failure)
+
+    def source(settings: Settings) -> AsyncGenerator[Frame, None]:
+        if recorder is not None:
+            recorder.gap(0)  # each time it is opened it begins anew
+        return open_source(settings, recorder)
+
+    daemon = Daemon(settings, on_second=each_second, on_estimate=each_estimate, sources=source)
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, daemon.stop)
     if not quiet:
@@ -241,6 +380,45 @@ async def _serve(settings: Settings, seconds: float | None, *, quiet: bool) -> N
             f"{c.source_failures} source failures; sent {_counts(daemon.component.sent)}, "
             f"{daemon.links.dropped} of them lost"
         )
+
+
+def _utc_ns(frame: Frame) -> int:
+    """Of the frame's first sample: as recorded, else by the clock of today."""
+    if frame.utc_ns is not None:
+        return frame.utc_ns
+    return time.time_ns() - time.monotonic_ns() + frame.t_ns
+
+
+def _callers(arguments: argparse.Namespace) -> Callers | None:
+    if arguments.export is None:
+        return None
+    from locagen_edge.export import Callers
+
+    return Callers(arguments.export)
+
+
+def _export_news(callers: Callers) -> None:
+    """Where nobody has been placed, what an earlier run has written stays."""
+    if callers.changed:
+        _export(callers)
+
+
+def _export(callers: Callers) -> None:
+    from locagen_edge.export import export
+
+    export(callers.events, callers.path)
+    print(f"locagen-edge: {len(callers.events)} callers in {callers.path}", file=sys.stderr)
+
+
+def _export_or_tell(callers: Callers, events: list[Event]) -> None:
+    """From a thread: a disk may take its time, and one that is full is no reason to stop."""
+    from locagen_edge.export import export
+
+    try:
+        export(events, callers.path)
+    except ExportError as error:
+        callers.changed = True  # so it is tried again
+        logging.error("%s", error)
 
 
 class LiveLine:
@@ -291,6 +469,9 @@ def describe(estimate: Estimate) -> str:
         parts.append(f"from north {compass_deg(track.earth.azimuth_rad):5.1f}°")
     if track is not None and track.elevation_rad is not None:
         parts.append(f"el {math.degrees(track.elevation_rad):3.0f}°")
+    place = estimate.position(track)
+    if place is not None and place.latitude_deg is not None:
+        parts.append(f"at {place.latitude_deg:.6f}, {place.longitude_deg:.6f} ±{place.semi_major_m:.0f} m")
     if len(estimate.tracks) > 1:
         parts.append(f"{len(estimate.tracks)} callers")
     parts.append(f"snr {estimate.detection.snr_db:5.1f} dB {'CALL' if estimate.detection.call else '    '}")
@@ -321,6 +502,7 @@ COLUMNS: dict[str, str] = {
     "misfit": "8.2f",
     "range_m": "8.2f",
     "estimator": "12",
+    "callers": "40",
     "faults": "",
 }
 """What one line of `replay` holds, and how the table prints it."""
@@ -342,23 +524,72 @@ def record(estimate: Estimate, t_s: float) -> dict[str, Any]:
         "misfit": round(b.misfit, 3) if math.isfinite(b.misfit) else None,
         "range_m": round(fix.range_m, 3) if fix is not None and fix.range_observable else None,
         "estimator": b.estimator,
+        "callers": [caller(track, estimate.position(track)) for track in estimate.tracks],
         "faults": list(estimate.faults),
     }
 
 
+def caller(track: Track, position: Position | None) -> dict[str, Any]:
+    """A track as plain values; the best is the first."""
+    earth = track.earth
+    shown: dict[str, Any] = {
+        "id": track.id,
+        "confirmed": track.confirmed,
+        "azimuth_deg": round(compass_deg(track.azimuth_rad), 4),
+        "sigma_deg": round(math.degrees(track.azimuth_sigma_rad), 4),
+        "from_north_deg": None if earth is None else round(compass_deg(earth.azimuth_rad), 4),
+        "latitude_deg": None,
+        "longitude_deg": None,
+        "semi_major_m": None,
+    }
+    if position is not None and position.latitude_deg is not None and position.longitude_deg is not None:
+        shown["latitude_deg"] = round(position.latitude_deg, 7)
+        shown["longitude_deg"] = round(position.longitude_deg, 7)
+        shown["semi_major_m"] = round(position.semi_major_m, 2)
+    return shown
+
+
+def _caller_in_words(c: dict[str, Any]) -> str:
+    words = f"{c['id']}: {c['azimuth_deg']:.1f}° ±{c['sigma_deg']:.1f}°"
+    if c["latitude_deg"] is not None:
+        words += f" at {c['latitude_deg']:.6f}, {c['longitude_deg']:.6f} ±{c['semi_major_m']:.0f} m"
+    return words if c["confirmed"] else f"({words})"
+
+
 def _replay(arguments: argparse.Namespace) -> int:
+    files = _recordings(arguments.files)
+    callers = _callers(arguments)
+    beside = files[0].with_suffix(".toml")
+    if arguments.settings is None and beside.is_file():
+        logging.info("settings: %s", beside)
+        arguments.settings = beside
     settings = _settings(arguments)
     if arguments.format == "table":
         print("  ".join(f"{name:>{_width(name)}}" for name in COLUMNS))
-    for line in replay(arguments.file, settings):
+    for line in replay(files, settings, callers):
         print(json.dumps(line) if arguments.format == "jsonl" else _row(line))
     sys.stdout.flush()
+    if callers is not None:
+        _export(callers)
     return 0
 
 
-def replay(path: Path, settings: Settings) -> Iterator[dict[str, Any]]:
-    """The records of a recording, hop by hop, with a progress bar where the error stream is a terminal
-    and the records go elsewhere."""
+def _recordings(paths: list[Path]) -> list[Path]:
+    """Files as given, folders as the recordings in them, by name: the order in which `record` made them."""
+    found: list[Path] = []
+    for path in paths:
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in (".wav", ".flac"))
+        if not inside:
+            raise SourceError(f"{path}: there is no WAV or FLAC in this folder")
+        found += inside
+    return found
+
+
+def replay(files: list[Path], settings: Settings, callers: Callers | None = None) -> Iterator[dict[str, Any]]:
+    """The records of recordings as if they were one, hop by hop, with a progress bar where the error stream
+    is a terminal and the records go elsewhere. `callers` hears them too."""
     from tqdm import tqdm
 
     from locagen_edge.pipeline import Pipeline
@@ -367,17 +598,20 @@ def replay(path: Path, settings: Settings) -> Iterator[dict[str, Any]]:
     pipeline = Pipeline(settings)
     rate_hz, frame_s = settings.audio.rate_hz, settings.audio.frame / settings.audio.rate_hz
     bar = tqdm(
-        total=round(wav_duration_s(path, settings), 1),
+        total=round(wav_duration_s(files, settings), 1),
         unit="s",
-        desc=path.name,
+        desc=files[0].name if len(files) == 1 else f"{len(files)} files",
         disable=not sys.stderr.isatty() or sys.stdout.isatty(),
         bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s of sound, {elapsed} so far",
     )
     with bar:
-        for frame in wav_frames(path, settings):
+        for frame in wav_frames(files, settings):
             t_s = frame.start / rate_hz
             bar.update(t_s + frame_s - bar.n)
-            yield record(pipeline.process(frame), t_s)
+            estimate = pipeline.process(frame)
+            if callers is not None:
+                callers.hear(estimate, _utc_ns(frame))
+            yield record(estimate, t_s)
         bar.update(bar.total - bar.n)  # what is left is shorter than a hop
 
 
@@ -392,9 +626,143 @@ def _row(line: dict[str, Any]) -> str:
         if isinstance(value, float):
             cells.append(f"{value:{form}}")
         else:
+            if name == "callers":
+                value = [_caller_in_words(c) for c in value]
             text = "; ".join(value) if isinstance(value, list) else "-" if value is None else str(value)
             cells.append(f"{text:>{_width(name)}}")
     return "  ".join(cells)
+
+
+# --- record -------------------------------------------------------------------------------------------
+
+
+def _record(arguments: argparse.Namespace) -> int:
+    from locagen_edge.store.recorder import Recorder
+
+    settings = _settings(arguments)
+    directory = arguments.output or Path(settings.record.directory)
+    recorder = Recorder(directory, settings)
+    try:
+        overruns = asyncio.run(_keep(settings, recorder, arguments.seconds))
+    finally:
+        if sys.stderr.isatty():
+            print(file=sys.stderr)
+        recorder.close()
+    if recorder.failure:
+        raise StorageError(recorder.failure)
+    done = recorder.progress()
+    print(
+        f"{done.seconds:.1f} s in {directory}, {overruns} overruns, {done.lost} blocks lost; "
+        f"hear it with: locagen-edge replay {directory}"
+    )
+    return 0
+
+
+async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -> int:
+    """Reads the source, which fills the recorder, until the time is over or a signal comes. Overruns."""
+    from locagen_edge.sources import open_source
+
+    stopping = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stopping.set)
+    stop = asyncio.create_task(stopping.wait())
+    overruns, second = 0, 0
+    async with contextlib.aclosing(open_source(settings, recorder)) as source:
+        while not recorder.failure:
+            coming = asyncio.ensure_future(anext(source, None))
+            await asyncio.wait([coming, stop], return_when=asyncio.FIRST_COMPLETED)
+            if stop.done():
+                coming.cancel()
+                await asyncio.gather(coming, return_exceptions=True)
+                break
+            frame = coming.result()
+            if frame is None:  # a recording's end
+                break
+            overruns += frame.overruns
+            heard_s = (frame.start + frame.samples.shape[1]) / frame.rate_hz
+            if seconds is not None and heard_s >= seconds:
+                break
+            if int(heard_s) > second:
+                second = int(heard_s)
+                _show(recorder.progress(), overruns)
+    stop.cancel()
+    return overruns
+
+
+def _show(progress: Progress, overruns: int) -> None:
+    """One line that is written over, on a terminal: what there is, and the level of each channel."""
+    if not sys.stderr.isatty():
+        return
+    levels = " ".join(f"{_dbfs(rms):4.0f}" for rms in progress.rms)
+    peak = _dbfs(max(progress.peak, default=0.0))
+    text = (
+        f"{progress.seconds:7.0f} s  {progress.name}  {progress.kept_bytes / 1e6:.1f} MB  "
+        f"rms {levels} dBFS, peak {peak:.0f}  {overruns} overruns, {progress.lost} lost"
+    )
+    print(f"\r{text[: shutil.get_terminal_size().columns - 1]}\033[K", end="", file=sys.stderr, flush=True)
+
+
+def _dbfs(amplitude: float) -> float:
+    return 20.0 * math.log10(max(amplitude, 1e-6))
+
+
+# --- log ----------------------------------------------------------------------------------------------
+
+
+def _log(arguments: argparse.Namespace) -> int:
+    from locagen_edge.store.blackbox import directory_of
+    from locagen_edge.store.journal import records
+    from locagen_edge.store.logbook import HEADER, chosen, row
+
+    directory = arguments.directory or directory_of(_settings(arguments)) or SERVICE_STATE
+    try:
+        found: Iterable[Record] = chosen(records(directory), set(arguments.type), arguments.since)
+        if arguments.last is not None:
+            found = deque(found, arguments.last)
+        if arguments.format == "table":
+            print(HEADER)
+        for record in found:
+            print(row(record) if arguments.format == "table" else json.dumps(record))
+    except (FileNotFoundError, NotADirectoryError):
+        raise StorageError(f"{directory}: there is no such folder; is log.directory set?") from None
+    except PermissionError:
+        raise StorageError(f"{directory}: may not be read: as root, or the user locagen-edge") from None
+    sys.stdout.flush()
+    return 0
+
+
+# --- fuse ---------------------------------------------------------------------------------------------
+
+
+def _fuse(arguments: argparse.Namespace) -> int:
+    from locagen_edge.export import event, export
+    from locagen_edge.fusion import fuse
+    from locagen_edge.sightings import read
+    from locagen_edge.store.blackbox import sightings
+
+    looks = (look for p in arguments.files for look in (sightings(p) if p.is_dir() else read(p)))
+    found = fuse(looks, _settings(arguments).position)
+    events = []
+    for number, fused in enumerate(found, start=1):
+        p = fused.position
+        if p.latitude_deg is None or p.longitude_deg is None:
+            azimuth, sigma = compass_deg(p.azimuth_rad), math.degrees(p.azimuth_sigma_rad)
+            place = f"range not observable; {azimuth:.1f}° ±{sigma:.1f}° from the last look"
+        else:
+            place = (
+                f"{p.latitude_deg:.6f}, {p.longitude_deg:.6f}  1-sigma {p.semi_major_m:.1f} m x "
+                f"{p.semi_minor_m:.1f} m at {math.degrees(p.orientation_rad):.0f}°"
+            )
+            told = event(p, p.t_ns, name=f"caller {number}")
+            events += [told] if told is not None else []
+        seen = ", ".join(f"{observer}/{caller}" for observer, caller in fused.streams)
+        print(f"caller {number}: {place}  ({fused.used} looks of {seen}; {fused.unused} not used)")
+    if not found:
+        print("no caller: no sighting could be used")
+    if arguments.output is not None:
+        export(events, arguments.output)
+    return 0
 
 
 # --- devices ------------------------------------------------------------------------------------------

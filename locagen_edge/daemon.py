@@ -23,7 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from locagen_edge.errors import LinkError, LocagenError, SourceError, SourceHungError
-from locagen_edge.mavlink.component import Component, Hands, Status
+from locagen_edge.mavlink.component import Component, Hands, Status, is_confirmed
 from locagen_edge.mavlink.computer import Computer
 from locagen_edge.mavlink.identity import machine_uid
 from locagen_edge.mavlink.link import parse
@@ -34,6 +34,7 @@ from locagen_edge.notify import notify
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings
 from locagen_edge.sources import open_source
+from locagen_edge.store.blackbox import BlackBox, directory_of
 from locagen_edge.types import Estimate, Frame
 
 log = logging.getLogger(__name__)
@@ -68,7 +69,8 @@ class Counters:
 class Daemon:
     """One source, one pipeline, one component on all its links.
 
-    `on_second(daemon)` is called once per second of the main loop. `sources` opens the source that the
+    `on_second(daemon)` is called once per second of the main loop, `on_estimate(frame, estimate)` for each
+    frame; neither may wait. `sources` opens the source that the
     settings name; a test passes its own.
     """
 
@@ -77,13 +79,17 @@ class Daemon:
         settings: Settings,
         *,
         on_second: Callable[[Daemon], None] | None = None,
+        on_estimate: Callable[[Frame, Estimate], None] | None = None,
         sources: Callable[[Settings], AsyncGenerator[Frame, None]] = open_source,
     ):
         self.settings = settings
         self.counters = Counters()
         self.estimate: Estimate | None = None
+        self._middle_ns = 0  # of its frame
         self.source_fault = ""
+        self.black_box: BlackBox | None = None
         self._on_second = on_second
+        self._on_estimate = on_estimate
         self._sources = sources
         self._stopping = asyncio.Event()
         self._queue: asyncio.Queue[Frame | None] = asyncio.Queue()
@@ -141,6 +147,9 @@ class Daemon:
             asyncio.create_task(self._work(), name="work"),
             asyncio.create_task(self._tick(), name="tick"),
         ]
+        log_directory = directory_of(self.settings)
+        if log_directory is not None:
+            self.black_box = BlackBox(log_directory, self.settings, is_confirmed)
         notify(STATUS="waiting for the first sound")
 
     async def main_loop(self) -> None:
@@ -185,6 +194,9 @@ class Daemon:
                 keep(kept_file(self.settings), self.component.parameters.changed)
         if self.component.guard.signs:
             self._remember_timestamp()
+        if self.black_box is not None:
+            # it has written all along: only a disk that hangs takes so long
+            self.black_box.close(max(start + STOP_S - time.monotonic(), 0.05))
         return not hanging and not self._working
 
     # --- source -> queue
@@ -229,19 +241,24 @@ class Daemon:
 
     async def _work(self) -> None:
         loop = asyncio.get_running_loop()
-        frame_ns = round(self.settings.audio.frame / self.settings.audio.rate_hz * 1e9)
         while (frame := await self._queue.get()) is not None:
             if not self.component.listening:  # told to stop: not looked at, not kept
                 self.estimate, self._heard_s = None, time.monotonic()
                 self._tell_ready()
                 continue
             self._working = True
-            pose = self.component.poses.at(frame.t_ns + frame_ns // 2)
-            self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
+            pose = frame.pose or self.component.poses.at(frame.middle_ns)
+            estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
+            self.estimate, self._middle_ns = estimate, frame.middle_ns
             self._working = False
+            if self.black_box is not None:
+                self.black_box.hear(frame, estimate)
+            if self._on_estimate is not None:
+                self._on_estimate(frame, estimate)
             self._heard_s = time.monotonic()
             self.counters.estimates += 1
-            self.counters.latency_s.append((time.monotonic_ns() - frame.t_ns - frame_ns) * 1e-9)
+            end_ns = 2 * frame.middle_ns - frame.t_ns
+            self.counters.latency_s.append((time.monotonic_ns() - end_ns) * 1e-9)
             self._send()
             self._tell_ready()
 
@@ -335,8 +352,18 @@ class Daemon:
         estimate = self.estimate
         if estimate is None:
             return Status(hearing=True, track=None, snr_db=0.0, faults=())
+        detection = estimate.detection
         return Status(
-            True, estimate.track, estimate.detection.snr_db, estimate.faults, others=estimate.tracks[1:]
+            hearing=True,
+            track=estimate.track,
+            snr_db=detection.snr_db,
+            faults=estimate.faults,
+            others=estimate.tracks[1:],
+            positions=estimate.positions,
+            t_ns=self._middle_ns,
+            noise_dbfs=detection.level_dbfs - detection.snr_db,
+            pose=estimate.pose,
+            simulated=self.settings.audio.source != "alsa",
         )
 
     async def _tick(self) -> None:
@@ -359,6 +386,17 @@ class Daemon:
             else:
                 notify(STATUS=self._in_words())
             self.counters.latency_s.clear()
+            if self.black_box is not None:
+                self.black_box.watch(**self._states())
+
+    def _states(self) -> dict[str, dict[str, object]]:
+        """What the black box keeps the changes of."""
+        c = self.counters
+        return {
+            "link": {"up": self.links.up == len(self.links.links), "error": self.links.last_error},
+            "source": {"fault": self.source_fault},
+            "losses": {"frames": c.dropped, "overruns": c.overruns, "messages": self.links.dropped},
+        }
 
     def _watch_signing(self) -> None:
         """Tells the log what the other end does not: that it ignores us. Keeps the timestamp."""
@@ -384,5 +422,7 @@ class Daemon:
         if not self.hearing:
             state = f"no sound: {self.source_fault or 'waiting'}"
         losses = f"{c.dropped} dropped, {c.overruns} overruns, {self.links.dropped} messages lost"
+        if self.black_box is not None and self.black_box.lost:
+            losses += f", {self.black_box.lost} log records lost"
         down = [f"link down: {self.links.last_error}"] if self.links.last_error else []
         return "; ".join([state, f"{c.estimates} frames, {losses}", *down, *self._complaints])

@@ -39,3 +39,11 @@ class DatasetError(LocagenError):
 
 class CalibrationError(LocagenError):
     """A recording from which the array cannot be calibrated. The text says what is missing and what to do."""
+
+
+class StorageError(LocagenError):
+    """A folder or disk that cannot be written to, or has no room left."""
+
+
+class ExportError(LocagenError):
+    """Sightings that cannot be read, or events that cannot be written."""

@@ -9,13 +9,34 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, Generator
+from collections.abc import AsyncGenerator, Callable, Generator
 from contextlib import closing
-from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
-from locagen_edge.types import F32, Frame
+from locagen_edge.types import F32, Array, Frame
+
+
+class Tap(Protocol):
+    """Hears all that a source delivers, before channels are chosen and rates changed.
+
+    The same blocks with the same origins, cut and resampled again, give the same frames, bit for bit. Both
+    are called in the thread that reads the source, and must not wait.
+    """
+
+    def block(self, rows: Array, rate_hz: float, origin_ns: int) -> None:
+        """Rows (n, channels), int16 or float32, its own to keep, and `Framer.origin_ns` as it is for them."""
+
+    def gap(self, overruns: int) -> None:
+        """Sound was lost before the next block; 0: none was, but the next begins anew."""
+
+
+def as_captured(samples: F32, channel_map: tuple[int, ...]) -> F32:
+    """(mics, n) as the rows (n, channels) that `audio.channel_map` would choose them from."""
+    rows = np.zeros((samples.shape[1], max(channel_map) + 1), dtype=np.float32)
+    rows[:, list(channel_map)] = samples.T
+    return rows
 
 
 class Framer:
@@ -62,15 +83,15 @@ class Framer:
         return self.origin_ns + round((sample - self._origin) * 1e9 / self._rate_hz)
 
 
-async def in_real_time(frames: Generator[Frame, None, None]) -> AsyncGenerator[Frame, None]:
-    """The same frames, each when its last sample would have been heard, stamped with monotonic time.
+async def in_real_time(
+    frames_from: Callable[[int], Generator[Frame, None, None]],
+) -> AsyncGenerator[Frame, None]:
+    """Frames whose time counts from now (monotonic), each when its last sample would have been heard.
 
     Where the reader is late, frames come as fast as they are taken until it has caught up: none is dropped.
     """
-    origin_ns = time.monotonic_ns()
-    with closing(frames):
+    with closing(frames_from(time.monotonic_ns())) as frames:
         for frame in frames:
-            t_ns = origin_ns + frame.t_ns
-            end_ns = t_ns + round(frame.samples.shape[1] * 1e9 / frame.rate_hz)
+            end_ns = frame.t_ns + round(frame.samples.shape[1] * 1e9 / frame.rate_hz)
             await asyncio.sleep(max(0.0, (end_ns - time.monotonic_ns()) * 1e-9))
-            yield replace(frame, t_ns=t_ns)
+            yield frame

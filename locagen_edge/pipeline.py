@@ -5,6 +5,7 @@ The same object flies in the daemon, replays recordings, is tested and is timed.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -16,13 +17,14 @@ from locagen_edge.stages.bearing.common import Locator
 from locagen_edge.stages.correlation import Correlator
 from locagen_edge.stages.detection import Detector
 from locagen_edge.stages.faults import FaultFinder
+from locagen_edge.stages.position import Positioner, sighting
 from locagen_edge.stages.tdoa import PeakPicker
 from locagen_edge.stages.track import Tracker
-from locagen_edge.types import Estimate, Frame, Pose
+from locagen_edge.types import Estimate, Frame, Pose, Sighting, Track
 
 
 class Pipeline:
-    """From sound to bearing, for one stream of frames.
+    """From sound to bearings and places, for one stream of frames.
 
     Raises `ModelError` or `KernelError` where the settings ask for what cannot be made.
     """
@@ -35,10 +37,12 @@ class Pipeline:
         self._correlate, self._pick, self._locate = _made_for_array(settings)
         self._detect = Detector(settings.detection)
         self._find_faults = FaultFinder()
+        self._tolerance_rad = tolerance_rad(array, settings.array.tolerance_m)
+        self._positioner = Positioner(settings.position)
         self._track = Tracker(
             settings.track,
             settings.pose,
-            tolerance_rad(array, settings.array.tolerance_m),
+            self._tolerance_rad,
             audio.frame / audio.hop,
             array.normal,
         )
@@ -69,8 +73,10 @@ class Pipeline:
     def process(self, frame: Frame, pose: Pose | None = None) -> Estimate:
         """The estimate for one frame. Frames have to come in the order of time; gaps are allowed.
 
-        `pose`: the vehicle's at the frame's middle; without one, callers are followed as the body sees them.
+        `pose`: the vehicle's at the frame's middle, if need be the frame's own; without one, callers are
+        followed as the body sees them.
         """
+        pose = pose or frame.pose
         if frame.samples.shape != self._shape:
             raise SourceError(f"a frame of shape {frame.samples.shape} came, settings say {self._shape}")
         elapsed_s = self._hop_s if self._last_ns is None else max(frame.t_ns - self._last_ns, 0) * 1e-9
@@ -81,6 +87,8 @@ class Pipeline:
         detection = self._detect(correlation, bearing, elapsed_s)
         self._locate.settle(detection.call)
         tracks = self._track((bearing,), detection, elapsed_s, pose.attitude if pose else None)
+        sightings = tuple(self._looks(tracks, pose))
+        positions = (self._positioner.position(t.id, frame.middle_ns) for t in tracks if t.confirmed)
         return Estimate(
             t_ns=frame.t_ns,
             start=frame.start,
@@ -93,7 +101,19 @@ class Pipeline:
             truth=frame.truth,
             tracks=tracks,
             pose=pose,
+            positions=tuple(position for position in positions if position is not None),
+            sightings=sightings,
         )
+
+    def _looks(self, tracks: tuple[Track, ...], pose: Pose | None) -> Iterator[Sighting]:
+        """This frame's own bearings of callers, those that went into their positions."""
+        s = self._settings
+        for track in tracks:
+            if pose is None or track.look is None or not track.confirmed:
+                continue
+            look = sighting(pose, track.look, track.id, s.position, s.pose, self._tolerance_rad)
+            if look is not None and self._positioner.see(look):
+                yield look
 
 
 def _made_for_array(settings: Settings) -> tuple[Correlator, PeakPicker, Locator]:

@@ -343,17 +343,89 @@ class PoseSettings:
     )
     compass_deg: float = setting(
         3.0,
-        "1-sigma of the true heading, magnetic declination included. It goes into azimuths from true north; "
-        "those from the nose keep the smaller sigma.",
+        "1-sigma of the true heading, magnetic declination included. It goes into azimuths from true north "
+        "(those from the nose keep the smaller sigma), and into positions: no average takes it away.",
         unit="degrees", least=0, most=90,
     )  # fmt: skip
-    tilt_deg: float = setting(1.0, "The same of roll and pitch.", unit="degrees", least=0, most=90)
+    tilt_deg: float = setting(
+        1.0, "The same of roll and pitch, mounting included.", unit="degrees", least=0, most=90
+    )
     relief_m: float = setting(
         15.0,
         "1-sigma of the ground's height against that of the take-off place. Counts where neither "
         "rangefinder nor terrain data tell the height over ground.",
         unit="m", least=0, most=5000,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PositionSettings:
+    """From bearings along the flight to a place on the map."""
+
+    vehicle: str = setting(
+        "",
+        "This vehicle's name in the sightings of the log, which `fuse` joins with those of others; empty: "
+        "the computer's name, which has to be another on each vehicle.",
+    )
+    range_m: tuple[float, ...] = setting(
+        (2.0, 1000.0),
+        "Least and greatest horizontal distance at which a caller may be; every doubling between them is as "
+        "likely as any other. The second well beyond what can be heard: a caller near it has no position.",
+        unit="m",
+        least=0.5,
+        most=20000,
+    )
+    look_s: float = setting(
+        0.2,
+        "Looks of one vehicle at one caller that follow sooner are left out: their noise is the last one's.",
+        unit="s",
+        least=0,
+        most=60,
+    )
+    gps_m: float = setting(
+        1.5, "1-sigma of the vehicle's place, per axis; it goes into the caller's whole.",
+        unit="m", least=0, most=1000,
+    )  # fmt: skip
+    bias_s: float = setting(
+        300.0,
+        "How long an error of compass, attitude, GPS and height lasts before it is another.",
+        unit="s",
+        least=1,
+        most=1e6,
+    )
+    terrain_m: float = setting(
+        1.0,
+        "1-sigma of the ground's height (or of the floor) at the caller against that below the vehicle.",
+        unit="m",
+        least=0,
+        most=1000,
+    )
+    terrain_share: float = setting(
+        0.03, "The same, per metre of distance: 0.03 is 3 m at 100 m. Hills need more.", least=0, most=1
+    )
+    walk_m: float = setting(
+        0.1,
+        "How far a caller strays, per square root of a second: 0.1 is 0.8 m in a minute, 1 is 8 m.",
+        unit="m/s^0.5",
+        least=0,
+        most=100,
+    )
+    gate_sigma: float = setting(
+        4.0, "Looks further off than this count as another sound.", unit="sigma", least=2, most=100
+    )
+    told_share: float = setting(
+        0.3,
+        "A place is told where the ellipse's longer semi-axis (1-sigma) is at most this share of the "
+        "distance, or 10 m; else the range counts as not observable.",
+        least=0.01,
+        most=1,
+    )
+    forget_s: float = setting(
+        120.0, "A place is kept for so long after the last look.", unit="s", least=1, most=1e5
+    )
+    callers: int = setting(
+        8, "Callers followed at once; beyond that the longest unheard is forgotten.", least=1, most=1000
+    )
 
 
 @dataclass(frozen=True)
@@ -474,6 +546,73 @@ class DaemonSettings:
 
 
 @dataclass(frozen=True)
+class RecordSettings:
+    """`locagen-edge record`: all channels of the source as they come, in parts, on disk."""
+
+    directory: str = setting("recordings", "Where the parts go; --output comes before it.")
+    part_s: float = setting(600.0, "Longest part.", unit="s", least=0.1, most=86400)
+    part_mb: float = setting(
+        1000.0, "Largest part; three channels of 16 bit at 48 kHz fill 17 MB a minute.",
+        unit="MB", least=0.01, most=4000,
+    )  # fmt: skip
+    total_mb: float = setting(
+        16000.0,
+        "All parts in the folder together, at least two of the largest; what other programs keep there does "
+        "not count.",
+        unit="MB",
+        least=0.1,
+        most=1e8,
+    )
+    free_mb: float = setting(
+        500.0, "What has to stay free on the disk, for whoever else writes there.",
+        unit="MB", least=0, most=1e8,
+    )  # fmt: skip
+    when_full: str = setting(
+        "stop",
+        "At either bound: `stop`, or give up the `oldest` parts of the folder for new ones.",
+        choices=("stop", "oldest"),
+    )
+    sync_s: float = setting(
+        2.0, "What a loss of power costs at most: so often all is forced to the disk.",
+        unit="s", least=0.1, most=60,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LogSettings:
+    """The black box of `locagen-edge run`: bearings and events, and on request the sound of each call."""
+
+    directory: str = setting(
+        "",
+        "Where it is kept; empty: the service's state directory, /var/lib/locagen-edge under systemd, and "
+        "nowhere when `run` is started by hand.",
+    )
+    total_mb: float = setting(
+        200.0, "All of the log; the oldest part is deleted for a new one. An hour of calls fills 50 MB.",
+        unit="MB", least=0.01, most=1e6,
+    )  # fmt: skip
+    part_mb: float = setting(10.0, "One part.", unit="MB", least=0.001, most=1000)
+    sync_s: float = setting(
+        2.0, "What a loss of power costs at most, of bearings; events are forced to the disk at once.",
+        unit="s", least=0.1, most=60,
+    )  # fmt: skip
+    snippets: bool = setting(
+        False, "Whether the sound of each confirmed call is kept too, as WAV that `replay` reads."
+    )
+    before_s: float = setting(
+        3.0, "A snippet begins so long before the call was confirmed.", unit="s", least=0, most=30
+    )
+    after_s: float = setting(
+        1.0, "A snippet ends so long after the track of the call has ended.", unit="s", least=0, most=60
+    )
+    longest_s: float = setting(60.0, "A snippet ends here at the latest.", unit="s", least=0.5, most=3600)
+    snippets_mb: float = setting(
+        500.0, "All snippets; the oldest is deleted for a new one. Three microphones fill 7 MB a minute.",
+        unit="MB", least=0.01, most=1e6,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class Settings:
     """All settings. Every section and every key may be left out."""
 
@@ -487,10 +626,13 @@ class Settings:
     detection: DetectionSettings = DetectionSettings()
     track: TrackSettings = TrackSettings()
     pose: PoseSettings = PoseSettings()
+    position: PositionSettings = PositionSettings()
     models: ModelsSettings = ModelsSettings()
     mavlink: MavlinkSettings = MavlinkSettings()
     flight: FlightSettings = FlightSettings()
     daemon: DaemonSettings = DaemonSettings()
+    record: RecordSettings = RecordSettings()
+    log: LogSettings = LogSettings()
 
     def __post_init__(self) -> None:
         faults = [*_faults_of_fields(self), *_faults_between_fields(self)]
@@ -556,6 +698,17 @@ def _faults_of_value(value: Any, meta: Any) -> Iterator[str]:
 def _faults_between_fields(s: Settings) -> Iterator[str]:
     yield from _faults_of_array(s)
     yield from _faults_of_link(s)
+    snippet_mb = (s.log.longest_s + 1.0) * s.audio.rate_hz * (max(s.audio.channel_map, default=0) + 1) * 4e-6
+    if s.log.snippets and s.log.snippets_mb < snippet_mb + 0.1:
+        yield (
+            f"log.snippets_mb: {s.log.snippets_mb:g} MB is less than one snippet of log.longest_s "
+            f"({snippet_mb + 0.1:.1f} MB)"
+        )
+    for name, section in (("record", s.record), ("log", s.log)):
+        if 2 * section.part_mb > section.total_mb:  # the part being written, and one to give up for it
+            yield f"{name}.total_mb: {section.total_mb:g} MB is less than two parts ({name}.part_mb)"
+    if len(s.position.range_m) != 2 or not 1.5 * s.position.range_m[0] < s.position.range_m[1]:
+        yield f"position.range_m: {list(s.position.range_m)} is not a least and a greatest distance"
     if s.audio.rate_hz > 0 and s.daemon.stall_s < 2 * s.hop_s:
         yield f"daemon.stall_s: {s.daemon.stall_s:g} s is less than two hops ({2 * s.hop_s:.3g} s)"
     if s.audio.frame & (s.audio.frame - 1):

@@ -1,6 +1,6 @@
 """What travels along the way, in the order of travel.
 
-    Frame -> Correlation -> Tdoa -> Bearing -> Track        (Detection, Pose and faults beside them)
+    Frame -> Correlation -> Tdoa -> Bearing -> Track -> Position  (Detection, Pose and faults beside them)
 
 Each type carries its own time and rate, so that no stage has to ask another for them. All are frozen;
 arrays inside are not to be written to. Conventions of axes, signs and units: CONTRIBUTING.md.
@@ -45,6 +45,15 @@ class Frame:
     overruns: int = 0
     """times that sound was lost between the previous frame and this one's end"""
     truth: Truth | None = None
+    pose: Pose | None = None
+    """of the vehicle at the middle, where a recording tells"""
+    utc_ns: int | None = None
+    """of the first sample, since 1970, where a recording tells"""
+
+    @property
+    def middle_ns(self) -> int:
+        """monotonic time of the middle"""
+        return self.t_ns + round(len(self.samples[0]) * 0.5e9 / self.rate_hz)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,6 +183,73 @@ class Pose:
     height_sigma_m: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """One look of one vehicle at one caller, in earth axes: what a position is made of.
+
+    What differs from look to look (`..._sigma_rad`) averages out; what is the same in all looks of a vehicle
+    for minutes (`..._bias_sigma...`, the place, the height) does not, and is told apart for that.
+    """
+
+    t_ns: int
+    """when the sound was heard, on a clock that all observers of one filter share"""
+    observer: str
+    """which vehicle"""
+    caller: int
+    """which caller: the number of the vehicle's track"""
+    latitude_deg: float
+    """of the vehicle, as are longitude, altitude and height"""
+    longitude_deg: float
+    azimuth_rad: float
+    """direction to the caller, clockwise from true north"""
+    azimuth_sigma_rad: float
+    altitude_m: float | None = None
+    """above mean sea level"""
+    height_m: float | None = None
+    """above the ground below; None: not known, and the elevation tells no range"""
+    height_sigma_m: float = 1.0
+    elevation_rad: float | None = None
+    """negative below the horizon; None where the array cannot tell"""
+    elevation_sigma_rad: float = 0.0
+    heading_rad: float = 0.0
+    """of the vehicle's nose, clockwise from true north: errors of the attitude turn with it"""
+    azimuth_bias_sigma_rad: float = 0.0
+    """of the compass"""
+    elevation_bias_sigma_rad: float = 0.0
+    """of roll and pitch, each"""
+    position_sigma_m: float = 0.0
+    """of the vehicle's place, per axis"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Position:
+    """Where a caller is on the map, with what that is worth."""
+
+    t_ns: int
+    caller: int
+    range_observable: bool
+    """False: the looks do not bound the range. There is a bearing, and no place."""
+    latitude_deg: float | None
+    longitude_deg: float | None
+    altitude_m: float | None
+    """of the ground there, above mean sea level; None where no vehicle told altitude and height"""
+    covariance_m2: F64
+    """(2, 2) of north and east, caller's walk, compass, GPS and terrain included; where the range is not
+    observable, of a place that is not told"""
+    semi_major_m: float
+    """1-sigma: the ellipse of both semi-axes holds the caller with 39 %, 2.45 times as large with 95 %"""
+    semi_minor_m: float
+    orientation_rad: float
+    """of the major axis, clockwise from true north, 0 to pi"""
+    azimuth_rad: float
+    """from the vehicle that looked last, clockwise from true north"""
+    azimuth_sigma_rad: float
+    age_s: float
+    """since the last look that agreed"""
+    looks: int
+    """how many did"""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """All that the pipeline says of one frame."""
@@ -193,6 +269,14 @@ class Estimate:
     """all callers, the best first"""
     pose: Pose | None = None
     """of the vehicle at the frame's middle"""
+    positions: tuple[Position, ...] = ()
+    """of those confirmed tracks whose looks told anything of a place; `caller` is the track's id"""
+    sightings: tuple[Sighting, ...] = ()
+    """the looks of this frame that went into positions"""
+
+    def position(self, track: Track | None) -> Position | None:
+        """Where the caller of this track is."""
+        return next((p for p in self.positions if track is not None and p.caller == track.id), None)
 
 
 Array = npt.NDArray[Any]

@@ -60,7 +60,9 @@ def recording(tmp_path_factory) -> Path:
 # --- help and usage
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["replay"], ["devices"], ["check"], ["calibrate"]])
+@pytest.mark.parametrize(
+    "command", [[], ["run"], ["replay"], ["record"], ["log"], ["fuse"], ["devices"], ["check"], ["calibrate"]]
+)
 def test_help_is_there(command):
     done = cli(*command, "--help")
     assert done.returncode == 0
@@ -77,6 +79,7 @@ def test_help_is_there(command):
         ["run", "--seconds", "0"],
         ["run", "--seconds", "x"],
         ["replay", "a", "--format", "xml"],
+        ["record", "--seconds", "-1"],
     ],
 )
 def test_wrong_usage_is_exit_code_2(arguments):

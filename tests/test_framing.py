@@ -82,15 +82,15 @@ def test_frames_own_their_samples():
 def test_real_time_is_not_before_the_sound_and_closes_what_it_reads():
     closed = []
 
-    def endless():
+    def endless(origin_ns):
         try:
             for k in itertools.count():
-                yield Frame(numbered(0, 100), RATE, k * 10_000_000, 100 * k)
+                yield Frame(numbered(0, 100), RATE, origin_ns + k * 10_000_000, 100 * k)
         finally:
             closed.append(True)
 
     async def listen():
-        source = in_real_time(endless())
+        source = in_real_time(endless)
         before = time.monotonic_ns()
         for k in range(3):
             frame = await anext(source)

@@ -11,8 +11,8 @@ import pytest
 import soundfile
 
 from locagen_edge.errors import DatasetError
+from locagen_edge.geodesy import north_east_down_m
 from locagen_edge.lab.cli import main
-from locagen_edge.lab.earth import north_east_down_m
 from locagen_edge.lab.evaluate import evaluate
 from locagen_edge.lab.labels import COLUMNS, read_labels
 from locagen_edge.lab.settings import LabSettings

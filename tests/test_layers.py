@@ -34,6 +34,7 @@ def modules_after(statement: str) -> set[str]:
         "import locagen_edge.check",
         "import locagen_edge.calibrate",
         "import locagen_edge.stages.mic",
+        "import locagen_edge.store.recorder",
         "from locagen_edge.pipeline import Pipeline; from locagen_edge.settings import from_table; "
         "Pipeline(from_table({'bearing': {'estimator': 'model:tdoa-mlp'}}))",
     ],
@@ -53,6 +54,7 @@ def test_what_is_not_used_is_not_loaded():
 GROUND = {
     "types",
     "geometry",
+    "geodesy",
     "errors",
     "settings",
     "kernel",
@@ -61,6 +63,8 @@ GROUND = {
     "resampling",
     "alignment",
     "files",
+    "jsonl",
+    "poses",
 }
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
@@ -69,12 +73,16 @@ ABOVE = {
     "mavlink": GROUND,
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
+    "store": GROUND | {"sightings"},
+    "export": GROUND,
+    "sightings": GROUND | {"export"},
+    "fusion": GROUND | {"stages"},
     "notify": set(),
     "mavproxy_locagen": GROUND | {"mavlink"},  # loaded by MAVProxy alone
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},
     "check": GROUND | {"stages", "mavlink", "pipeline", "sources"},
-    "daemon": GROUND | {"stages", "mavlink", "pipeline", "sources", "notify"},
+    "daemon": GROUND | {"stages", "mavlink", "pipeline", "sources", "notify", "store"},
 }
 """What each part may import. The command line and the workshop stand on top and may import anything."""
 

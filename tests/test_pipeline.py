@@ -492,7 +492,7 @@ def test_a_muted_input_is_no_background():
 
 
 def check_replay(settings: Settings, path, azimuth: float, called: tuple[float, float], right=0.95) -> None:
-    lines = list(replay(path, settings))
+    lines = list(replay([path], settings))
     inside = [line for line in lines if called[0] <= line["t_s"] <= called[1] - 0.1]
     calls = [line for line in inside if line["call"]]
     assert len(calls) > 0.25 * len(inside), "speech has pauses, but a quarter of it has to be found"

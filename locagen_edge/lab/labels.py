@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from locagen_edge.errors import DatasetError
-from locagen_edge.lab.earth import north_east_down_m
+from locagen_edge.geodesy import north_east_down_m
 
 NAMES = ("labels.csv", "labels.jsonl")
 

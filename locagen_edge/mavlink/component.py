@@ -12,15 +12,18 @@ The profile, for any ground station and autopilot as they are:
   above the horizon, or that of the body where the attitude is not known; left out where the array cannot
   tell), LG_SIG (1-sigma of the azimuth, degrees: of LG_AZ where it is sent, compass and all), LG_CONF (0 to
   1), LG_SNR (dB, in-band).
-- STATUSTEXT once per confirmed call, once per fault and once when a fault has gone, in chunks where it is
-  long; and how many had to be left out, where they came too fast.
+- LOCAGEN_BEARING at the same rate for the best track and every other confirmed one, LOCAGEN_POSITION for
+  those whose place is known; once a second that nothing is heard. As messages and inside TUNNEL.
+- STATUSTEXT once per confirmed call, once when its place is known, once per fault and once when a fault has
+  gone, in chunks where it is long; and how many had to be left out, where they came too fast.
 - COMMAND_LONG to the autopilot, to have its attitude and position sent: never any other command, unless the
   settings file switches on what acts on flight (`flight.py`).
 - TIMESYNC, asked of the autopilot and answered (`timesync.py`).
 - Answers to parameters (`parameters.py`) and commands (`commands.py`), to the link that asked.
 - What the switches `mavlink.send_...` let out; nothing that is not in `dialect.SENT` ever leaves.
 
-ArduPilot forwards the first three between its links and writes two of them into its log. Times are monotonic
+ArduPilot forwards HEARTBEAT, NAMED_VALUE_FLOAT, TUNNEL and STATUSTEXT between its links, and writes values
+and texts into its log. Times are monotonic
 seconds. Call `due` only while the link is up, and `say_again` when it has come up: then nothing that
 holds is said to nobody.
 """
@@ -31,9 +34,10 @@ import math
 import struct
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+from locagen_edge.geodesy import north_east_down_m
 from locagen_edge.geometry import compass_deg
 from locagen_edge.mavlink import dialect, parameters, timesync
 from locagen_edge.mavlink.commands import Commands
@@ -43,12 +47,13 @@ from locagen_edge.mavlink.identity import version_message
 from locagen_edge.mavlink.pace import Every
 from locagen_edge.mavlink.parameters import Parameters
 from locagen_edge.mavlink.pose import READ, PoseHistory
+from locagen_edge.mavlink.records import BearingRecord, PositionRecord, bearing_message, position_message
 from locagen_edge.mavlink.signing import Guard
 from locagen_edge.mavlink.streams import GAP_S, Streams
 from locagen_edge.mavlink.targets import Place, adsb_vehicle, camera_target
 from locagen_edge.mavlink.timesync import SyncedClock
 from locagen_edge.settings import MavlinkSettings, PoseSettings, Settings
-from locagen_edge.types import Track
+from locagen_edge.types import Pose, Position, Track
 
 HEARTBEAT_S = 1.0
 """what MAVLink's heartbeat protocol asks of every component"""
@@ -61,6 +66,8 @@ FAULT_GONE_S = 5.0
 """a fault has gone when it stayed away this long: one that flickers is told once, not each time"""
 TEXT_S = 0.5
 """least mean distance of two texts: a radio link at 57600 baud and a reader's eye both bear it"""
+NOTHING_S = 1.0
+"""how often it is told that nothing is heard"""
 CALLS_REMEMBERED = 16
 """tracks of which the operator was told; more than can be followed at a time"""
 TEXTS_WAITING = 8
@@ -79,6 +86,10 @@ _FIRST_SYSTEM_ID = 1  # until the autopilot is heard; every autopilot's default
 _GROUND_STATION_ID = 255
 
 
+Moment = tuple[int, bool]
+"""microseconds, and whether they are on the autopilot's clock"""
+
+
 @dataclass(frozen=True, slots=True)
 class Status:
     """What the daemon knows at this moment."""
@@ -91,8 +102,37 @@ class Status:
     """what is wrong now, in words for the operator; the same fault always in the same words"""
     others: tuple[Track, ...] = ()
     """callers beside `track`; the operator is told of each, values are sent of `track` alone"""
-    places: tuple[Place, ...] = ()
-    """where callers are estimated to be"""
+    positions: tuple[Position, ...] = ()
+    """of any of them, by the track's id"""
+    t_ns: int = 0
+    """monotonic time of the middle of the sound that all this follows from"""
+    noise_dbfs: float | None = None
+    """tracked background"""
+    pose: Pose | None = None
+    """of the vehicle at that time"""
+    simulated: bool = False
+    """the sound is synthetic or recorded"""
+
+    def place(self, track: Track) -> Position | None:
+        """Where the caller of this track is; None too where no range is observable."""
+        return next((p for p in self._on_earth if p.caller == track.id), None)
+
+    @property
+    def _on_earth(self) -> Iterator[Position]:
+        for p in self.positions:
+            known = p.latitude_deg is not None and p.longitude_deg is not None
+            if known and abs(p.latitude_deg or 0.0) <= 90.0 and abs(p.longitude_deg or 0.0) <= 180.0:
+                yield p
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """Of all callers whose place is known."""
+        return tuple(
+            Place(
+                p.caller, p.latitude_deg or 0.0, p.longitude_deg or 0.0, p.altitude_m, p.semi_major_m, p.age_s
+            )
+            for p in self._on_earth
+        )
 
 
 def _nothing(*_: Any) -> None:
@@ -154,10 +194,12 @@ class Component:
             dialect.COMMANDS | self._interlock.commands,
         )
         self._every = {id: Every(period_s) for id, period_s in _periods(settings).items()}
+        self._nothing = Every(NOTHING_S)
         self._text = Every(TEXT_S)
         self._texts: deque[tuple[int, str]] = deque()
         self._faults: dict[str, float] = {}  # told, and when each was last there
         self._told: deque[int] = deque(maxlen=CALLS_REMEMBERED)
+        self._placed: deque[int] = deque(maxlen=CALLS_REMEMBERED)
         pose = pose or PoseSettings()
         self._streams = Streams(pose.rate_hz)
         self.clock = SyncedClock()
@@ -369,6 +411,7 @@ class Component:
         self._texts.clear()
         self._faults.clear()
         self._told.clear()
+        self._placed.clear()
 
     def _messages(self, now_s: float, status: Status) -> Iterator[tuple[str, Any]]:
         if status.hearing and self._every[dialect.HEARTBEAT].due(now_s):
@@ -391,6 +434,9 @@ class Component:
             time_boot_ms = round((now_s - self._start_s) * 1000)
             for name, value in bearing_values(status.track, status.snr_db):
                 yield name, dialect.named_value_float(time_boot_ms, name, value)
+        for message in self._records(now_s, status):
+            yield message.get_type(), message
+            yield "TUNNEL", dialect.tunnel(message)
         yield from self._due_places(now_s, status.places)
         called = status.track if status.track and is_confirmed(status.track) else None
         for command, text in self._interlock.due(now_s, self.system_id, called, status.places):
@@ -421,6 +467,29 @@ class Component:
             surest = min(known, key=lambda place: place.sigma_m)
             yield "CAMERA_TRACKING_GEO_STATUS", camera_target(surest, from_deg)
 
+    def _records(self, now_s: float, status: Status) -> Iterator[Any]:
+        """LOCAGEN_BEARING and LOCAGEN_POSITION of all callers, or that nothing is heard."""
+        every = self._every[dialect.LOCAGEN_BEARING]
+        if status.track is None:
+            if math.isfinite(every.period_s) and self._nothing.due(now_s):
+                yield bearing_message(_bearing_record(self._time_of(status), status, None))
+            return
+        if not every.due(now_s):
+            return
+        time = self._time_of(status)
+        for track in (status.track, *status.others):
+            if track is not status.track and not is_confirmed(track):
+                continue
+            yield bearing_message(_bearing_record(time, status, track))
+            place = status.place(track)
+            if place is not None and is_confirmed(track):
+                yield position_message(_position_record(time, status, place, track.id in self._placed))
+
+    def _time_of(self, status: Status) -> Moment:
+        """Of the sound: on the autopilot's clock where that is known, else since our start."""
+        time_us, on_autopilot = self.clock.time_us(status.t_ns)
+        return time_us if on_autopilot else time_us - round(self._start_s * 1e6), on_autopilot
+
     def _answer(self, link: int, *messages: Any) -> None:
         for message in messages:
             self._answers[link].append(self._pack(message.get_type(), message))
@@ -433,9 +502,14 @@ class Component:
 
     def _follow_call(self, status: Status) -> None:
         for track in (status.track, *status.others):
-            if track and track.id not in self._told and is_confirmed(track):
+            if not track or not is_confirmed(track):
+                continue
+            how_far = _how_far(status, track) if track.id not in self._placed else ""
+            if track.id not in self._told or how_far:
+                self._say(dialect.SEVERITY_NOTICE, call_text(track, how_far), first=True)
                 self._told.append(track.id)
-                self._say(dialect.SEVERITY_NOTICE, call_text(track), first=True)
+            if how_far:
+                self._placed.append(track.id)
 
     def _follow_faults(self, now_s: float, faults: tuple[str, ...]) -> None:
         for fault in faults:
@@ -483,8 +557,11 @@ def bearing_values(track: Track, snr_db: float) -> Iterator[tuple[str, float]]:
     yield from _value("LG_SNR", snr_db, -200, 200)
 
 
-def call_text(track: Track) -> str:
-    """One line for the operator, at most 50 characters: where a confirmed call comes from, with 1-sigma."""
+def call_text(track: Track, how_far: str = "") -> str:
+    """One line for the operator, at most 50 characters: where a confirmed call comes from, with 1-sigma.
+
+    `how_far`: the distance in words, where it is known; it takes the place of the bearing's sigma.
+    """
     body = _whole(compass_deg(track.azimuth_rad))
     where, sigma = f"{body} deg clockwise from nose", math.degrees(track.azimuth_sigma_rad)
     if track.earth is not None and not math.isnan(true := compass_deg(track.earth.azimuth_rad)):
@@ -492,7 +569,73 @@ def call_text(track: Track) -> str:
             f"{_whole(true)} deg true, {body} from nose",
             math.degrees(track.earth.azimuth_sigma_rad),
         )
+        if how_far:
+            where = f"{_whole(true)} deg true"
+    if how_far:
+        return f"Call heard: {where}, {how_far}"
     return f"Call heard: {where}" + (f", +-{max(1, round(sigma))} deg" if 0 <= sigma <= 180 else "")
+
+
+def _how_far(status: Status, track: Track) -> str:
+    """How far from the vehicle the caller is, over the ground, with the longer semi-axis (1-sigma)."""
+    place, pose = status.place(track), status.pose
+    if place is None or pose is None or pose.latitude_deg is None or pose.longitude_deg is None:
+        return ""
+    assert place.latitude_deg is not None
+    assert place.longitude_deg is not None
+    away = north_east_down_m(
+        place.latitude_deg, place.longitude_deg, 0.0, pose.latitude_deg, pose.longitude_deg, 0.0
+    )
+    return f"{math.hypot(away[0], away[1]):.0f} m +-{max(1, round(place.semi_major_m))} m"
+
+
+def _bearing_record(time: Moment, status: Status, track: Track | None) -> BearingRecord:
+    heard = BearingRecord(
+        time_us=time[0],
+        autopilot_time=time[1],
+        event_id=0,
+        snr_db=status.snr_db,
+        noise_dbfs=status.noise_dbfs,
+        pose=status.pose,
+        microphone_fault=bool(status.faults),
+        simulated=status.simulated,
+    )
+    if track is None:
+        return heard
+    return replace(
+        heard,
+        event_id=track.id,
+        azimuth_body_rad=track.azimuth_rad,
+        azimuth_true_rad=None if track.earth is None else track.earth.azimuth_rad,
+        azimuth_sigma_rad=track.azimuth_sigma_rad,
+        elevation_rad=track.elevation_rad,
+        elevation_sigma_rad=None if track.elevation_rad is None else track.elevation_sigma_rad,
+        confidence=track.confidence,
+        confirmed=is_confirmed(track),
+    )
+
+
+def _position_record(time: Moment, status: Status, place: Position, told: bool) -> PositionRecord:
+    assert place.latitude_deg is not None
+    assert place.longitude_deg is not None
+    (nn, ne), (_, ee) = place.covariance_m2.tolist()
+    # the ground at the caller is told where a depression over a height was: without one, bearings crossed
+    on_ground = place.altitude_m is not None
+    return PositionRecord(
+        time_us=time[0],
+        autopilot_time=time[1],
+        event_id=place.caller,
+        latitude_deg=place.latitude_deg,
+        longitude_deg=place.longitude_deg,
+        altitude_m=place.altitude_m,
+        covariance_m2=(nn, ne, ee),
+        age_s=place.age_s,
+        looks=place.looks,
+        triangulated=not on_ground,
+        on_ground=on_ground,
+        confirmed=told,
+        simulated=status.simulated,
+    )
 
 
 def _whole(degrees: float) -> str:
@@ -520,6 +663,7 @@ def _periods(settings: MavlinkSettings) -> dict[int, float]:
     return {
         dialect.HEARTBEAT: HEARTBEAT_S,
         dialect.NAMED_VALUE_FLOAT: 1.0 / settings.rate_hz,
+        dialect.LOCAGEN_BEARING: 1.0 / settings.rate_hz,  # LOCAGEN_POSITION goes with it
         dialect.ADSB_VEHICLE: PLACES_S,
         dialect.CAMERA_TRACKING_GEO_STATUS: PLACES_S,
         dialect.ONBOARD_COMPUTER_STATUS: COMPUTER_S,

@@ -17,7 +17,7 @@ from itertools import count, repeat
 
 import numpy as np
 
-from locagen_edge.framing import Framer, in_real_time
+from locagen_edge.framing import Framer, Tap, as_captured, in_real_time
 from locagen_edge.geometry import angles
 from locagen_edge.settings import Settings
 from locagen_edge.sim.calls import CALLS
@@ -202,16 +202,20 @@ class Tape:
         return np.concatenate([before, sound])
 
 
-def frames(settings: Settings) -> Generator[Frame, None, None]:
-    """Frames of the scene without an end, each with its truth, as fast as taken; time counts from 0."""
+def frames(settings: Settings, tap: Tap | None = None, origin_ns: int = 0) -> Generator[Frame, None, None]:
+    """Frames of the scene without an end, each with its truth, as fast as taken; time counts from
+    `origin_ns`."""
     audio = settings.audio
     scene = Scene(settings)
-    framer = Framer(audio.frame, audio.hop, settings.mic_array.mics, audio.rate_hz)
+    framer = Framer(audio.frame, audio.hop, settings.mic_array.mics, audio.rate_hz, origin_ns)
     while True:
-        for frame in framer.push(scene.render(audio.hop)):
+        block = scene.render(audio.hop)
+        if tap is not None:
+            tap.block(as_captured(block, audio.channel_map), audio.rate_hz, framer.origin_ns)
+        for frame in framer.push(block):
             yield replace(frame, truth=scene.truth(frame.start + audio.frame / 2))
 
 
-def sim(settings: Settings) -> AsyncGenerator[Frame, None]:
+def sim(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Frame, None]:
     """The same in real time."""
-    return in_real_time(frames(settings))
+    return in_real_time(lambda origin_ns: frames(settings, tap, origin_ns))

@@ -17,22 +17,25 @@ import math
 import re
 import threading
 import time
-from collections.abc import AsyncGenerator, Callable, Generator, Iterator
+from collections.abc import AsyncGenerator, Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from types import ModuleType
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import soundfile
 
 from locagen_edge.alignment import Aligner
 from locagen_edge.errors import SourceError, SourceHungError
-from locagen_edge.framing import Framer, in_real_time
+from locagen_edge.framing import Framer, Tap, in_real_time
+from locagen_edge.jsonl import Record, read
+from locagen_edge.poses import Poses, pose_of
 from locagen_edge.resampling import Resampler
 from locagen_edge.settings import Settings
-from locagen_edge.types import Array, Frame
+from locagen_edge.types import Array, Frame, Pose
 
 log = logging.getLogger(__name__)
 
@@ -50,26 +53,33 @@ _hung: threading.Thread | None = None  # a reading thread that did not come back
 class _Cutter:
     """Rows as a device or file gives them, into frames: channels chosen, resampled, aligned, turned, cut."""
 
-    def __init__(self, settings: Settings, rate_in: float) -> None:
+    def __init__(self, settings: Settings, rate_in: float, tap: Tap | None = None) -> None:
         audio = settings.audio
+        self._rate_in = rate_in
+        self._tap = tap
         self._map = list(audio.channel_map)
         self._resampler = Resampler(rate_in, audio.rate_hz, len(self._map))
         array = settings.array
         self._aligner = Aligner(array.delays_s, array.gains_db, audio.rate_hz, len(self._map))
         self.framer = Framer(audio.frame, audio.hop, len(self._map), audio.rate_hz)
 
-    def push(self, rows: Array, *, last: bool = False) -> list[Frame]:
-        """Frames from (n, channels), int16 or float32. `last`: the resampler gives up all it holds."""
+    def push(self, rows: Array) -> list[Frame]:
+        """Frames from (n, channels), int16 or float32."""
+        if self._tap is not None:
+            self._tap.block(rows, self._rate_in, self.framer.origin_ns)
         chosen = rows[:, self._map].astype(np.float32)
         if rows.dtype == np.int16:
             chosen /= 32768.0  # full scale 1.0
-        if last:
-            ready = self._aligner.flush(self._resampler.flush(chosen))
-        else:
-            ready = self._aligner.push(self._resampler.push(chosen))
-        return self.framer.push(ready.T)
+        return self.framer.push(self._aligner.push(self._resampler.push(chosen)).T)
+
+    def finish(self) -> list[Frame]:
+        """The last frames: resampler and aligner give up all they hold."""
+        rest = self._resampler.flush(np.empty((0, len(self._map)), dtype=np.float32))
+        return self.framer.push(self._aligner.flush(rest).T)
 
     def gap(self, overruns: int = 1) -> None:
+        if self._tap is not None:
+            self._tap.gap(overruns)
         self._resampler.clear()
         self._aligner.clear()
         self.framer.gap(overruns)
@@ -106,7 +116,7 @@ def devices() -> list[Device]:
     return _devices(_portaudio())
 
 
-async def alsa(settings: Settings) -> AsyncGenerator[Frame, None]:
+async def alsa(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Frame, None]:
     """Frames from the device that `audio.device` names, until it fails or the reader closes.
 
     Raises `SourceError` when the device is missing, refuses the settings, goes away, or gives nothing for
@@ -121,7 +131,8 @@ async def alsa(settings: Settings) -> AsyncGenerator[Frame, None]:
     box = _Mailbox(asyncio.get_running_loop(), settings.daemon.queue_frames + at_once)
     stop = threading.Event()
     # A daemon thread: one that hangs in a driver must not keep the process from ending.
-    thread = threading.Thread(target=_capture_into, args=(box, settings, stop), name="capture", daemon=True)
+    arguments = (box, settings, stop, tap)
+    thread = threading.Thread(target=_capture_into, args=arguments, name="capture", daemon=True)
     thread.start()
     patience_s = OPEN_S + settings.daemon.stall_s
     try:
@@ -193,12 +204,12 @@ class _Mailbox:
                 raise self._failure
 
 
-def _capture_into(box: _Mailbox, settings: Settings, stop: threading.Event) -> None:
+def _capture_into(box: _Mailbox, settings: Settings, stop: threading.Event, tap: Tap | None) -> None:
     """The reading thread."""
     failure = None
     try:
         with _opened(_portaudio(), settings) as stream:
-            for frame in capture(stream, settings, stop.wait):
+            for frame in capture(stream, settings, stop.wait, tap=tap):
                 box.put(frame)
     except SourceError as error:
         failure = error
@@ -222,13 +233,14 @@ def capture(
     settings: Settings,
     wait: Callable[[float], bool],
     now_ns: Callable[[], int] = time.monotonic_ns,
+    tap: Tap | None = None,
 ) -> Iterator[Frame]:
     """Frames from an open stream until `wait` (seconds) returns True: stop.
 
     Raises `SourceError` when no sample comes for `daemon.stall_s`.
     """
     rate_hz = settings.audio.device_rate_hz
-    cutter = _Cutter(settings, rate_hz)
+    cutter = _Cutter(settings, rate_hz, tap)
     clock = SampleClock(rate_hz)
     samples = 0
     heard_ns = now_ns()
@@ -377,61 +389,200 @@ def _reason(error: Exception) -> str:
 BLOCK_ROWS = 8192  # a quarter of a megabyte for 8 channels; a few ms of work
 
 
-def wav_frames(path: Path | str, settings: Settings) -> Iterator[Frame]:
-    """Frames of a recording as fast as they are taken; time counts from 0.
+def wav_frames(paths: Path | str | Sequence[Path], settings: Settings) -> Iterator[Frame]:
+    """Frames of a recording, or of several as if they were one, as fast as taken; time counts from 0.
+
+    Parts of `locagen-edge record` give the frames of the day, bit for bit: the records beside them tell how
+    the sound was cut, what was lost, and what the card's clock said. What does not follow on what comes
+    before begins anew: no frame holds sound from both. Where the vehicle's poses were recorded too, frames
+    have them.
 
     Raises `SourceError`, naming the file, for one that is missing, empty, damaged, no audio, too slow for the
     band, too short for a frame, or without the channels that `audio.channel_map` names.
     """
-    return _wav_frames(path, settings, loop=False)
+    return _wav_frames(_several(paths), settings, loop=False)
 
 
-def wav(settings: Settings) -> AsyncGenerator[Frame, None]:
+def wav(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Frame, None]:
     """The recording `audio.file` in real time, again and again if `audio.loop`. Raises like `wav_frames`."""
-    return in_real_time(_wav_frames(settings.audio.file, settings, loop=settings.audio.loop))
+    paths, loop = [Path(settings.audio.file)], settings.audio.loop
+    return in_real_time(lambda now_ns: _wav_frames(paths, settings, loop=loop, tap=tap, origin_ns=now_ns))
 
 
-def wav_duration_s(path: Path | str, settings: Settings) -> float:
-    """Length of the recording in seconds. Raises like `wav_frames`."""
-    with _opened_wav(path, settings) as file:
-        return float(file.frames / file.samplerate)
+def wav_duration_s(paths: Path | str | Sequence[Path], settings: Settings) -> float:
+    """Length of the recordings together in seconds. Raises like `wav_frames`."""
+    paths = _several(paths)
+    seconds = 0.0
+    for path in paths:
+        with _opened_wav(path, settings, tell=False) as file:
+            seconds += file.frames / file.samplerate
+    frame_s = settings.audio.frame / settings.audio.rate_hz
+    if seconds < frame_s:  # together: a recording's last part may be as short as it is
+        name = str(paths[0]) if len(paths) == 1 else f"{len(paths)} files"
+        raise SourceError(f"{name}: holds {seconds:.3g} s, less than one frame ({frame_s:.3g} s)")
+    return seconds
 
 
-def _wav_frames(path: Path | str, settings: Settings, *, loop: bool) -> Generator[Frame, None, None]:
-    with _opened_wav(path, settings) as file:
-        cutter = _Cutter(settings, file.samplerate)
-        while True:
-            yield from _one_pass(file, path, cutter)
-            if not loop:
-                return
-            cutter.gap(overruns=0)  # end and beginning do not belong together, but nothing is lost
-            file.seek(0)
+def _several(paths: Path | str | Sequence[Path]) -> list[Path]:
+    return [Path(paths)] if isinstance(paths, (str, Path)) else list(paths)
 
 
-def _one_pass(file: soundfile.SoundFile, path: Path | str, cutter: _Cutter) -> Iterator[Frame]:
-    done = 0
-    last = False
-    while not last:
-        try:
-            rows = file.read(BLOCK_ROWS, dtype="float32", always_2d=True)
-        except soundfile.LibsndfileError as error:
-            raise SourceError(f"{path}: damaged after {done / file.samplerate:.1f} s") from error
-        done += len(rows)
-        last = len(rows) < BLOCK_ROWS
-        yield from cutter.push(rows, last=last)
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Rows of a recording, and what is known of them."""
+
+    path: Path
+    rate_hz: int
+    rows: Array
+    origin_ns: int | None
+    """as recorded, by the clock of that day"""
+    gap: int | None
+    """overruns before these rows; 0: nothing was lost, but they do not follow on those before"""
+    new_clock: bool
+    """whether its clock has nothing to do with the one before"""
+    part: Record
+    """of the file it is from; empty: nothing was recorded beside it"""
+
+
+def _wav_frames(
+    paths: list[Path], settings: Settings, *, loop: bool, tap: Tap | None = None, origin_ns: int = 0
+) -> Generator[Frame, None, None]:
+    wav_duration_s(paths, settings)
+    with _opened_wav(paths[0], settings, tell=False) as file:
+        rate_hz = file.samplerate
+    cutter = _Cutter(settings, rate_hz, tap)
+    cutter.framer.origin_ns = origin_ns
+    day = _Day(cutter.framer, paths)
+    while True:
+        for piece in _pieces(paths, settings):
+            if piece.rate_hz != rate_hz:
+                raise SourceError(
+                    f"{piece.path}: {piece.rate_hz} Hz, but what comes before it has {rate_hz} Hz: "
+                    "replay them one by one"
+                )
+            if piece.gap is not None:
+                if piece.gap == 0:
+                    yield from map(day.told, cutter.finish())
+                cutter.gap(piece.gap)
+            day.follow(piece)
+            yield from map(day.told, cutter.push(piece.rows))
+        yield from map(day.told, cutter.finish())
+        if not loop:
+            return
+        cutter.gap(overruns=0)  # end and beginning do not belong together, but nothing is lost
+
+
+class _Day:
+    """Recorded times, moved so that they go on from what the framer's clock says, and what else was recorded
+    of these times."""
+
+    def __init__(self, framer: Framer, paths: list[Path]) -> None:
+        self._framer = framer
+        self._offset_ns: int | None = None
+        self._utc_ns: int | None = None  # when the recorded clock was 0
+        self._poses = Poses(())
+        # all at once: a pose comes after its sound, maybe in the next part
+        self._of_session: dict[Any, list[Pose]] = {}
+        for path in paths:
+            part, *records = _beside(path)
+            poses = self._of_session.setdefault(part.get("session"), [])
+            poses += [pose for record in records if (pose := pose_of(record)) is not None]
+
+    def told(self, frame: Frame) -> Frame:
+        """The frame with what was recorded of its time."""
+        if self._offset_ns is None:
+            return frame
+        then_ns = frame.t_ns - self._offset_ns
+        pose = self._poses.at(frame.middle_ns - self._offset_ns)
+        return replace(
+            frame,
+            pose=None if pose is None else replace(pose, t_ns=frame.middle_ns),
+            utc_ns=None if self._utc_ns is None else then_ns + self._utc_ns,
+        )
+
+    def follow(self, piece: _Piece) -> None:
+        if piece.new_clock:
+            self._offset_ns = None
+            self._utc_ns = _utc_of_0_ns(piece.part)
+            self._poses = Poses(self._of_session[piece.part.get("session")])
+        if piece.origin_ns is not None:
+            if self._offset_ns is None:
+                self._offset_ns = self._framer.origin_ns - piece.origin_ns
+            self._framer.origin_ns = piece.origin_ns + self._offset_ns
+
+
+def _pieces(paths: list[Path], settings: Settings) -> Iterator[_Piece]:
+    """The files one after another, cut as they were captured where the records beside them tell."""
+    ended: tuple[Any, Any] | None = None  # session and row after the last of the file before
+    for path in paths:
+        part, *records = _beside(path)
+        marks = [r for r in records if _is_block(r) or _is_gap(r)]
+        follows = ended is not None and ended == (part.get("session"), part.get("row"))
+        gap = None if ended is None or follows else 0
+        new_clock = not follows
+        done = 0
+        with _opened_wav(path, settings) as file:
+            rate_hz = file.samplerate
+            for mark in [*marks, {}]:
+                if mark.get("type") == "gap":
+                    gap = int(mark["overruns"])
+                    continue
+                rest = not mark  # after the last record: what has none
+                while rows := _rows(file, path, BLOCK_ROWS if rest else int(mark["rows"]), done):
+                    done += len(rows[0])
+                    yield _Piece(path, rate_hz, rows[0], mark.get("origin_ns"), gap, new_clock, part)
+                    gap, new_clock = None, False
+                    if not rest:
+                        break
+        ended = (part.get("session", path), part.get("row", 0) + done)
+
+
+def _beside(path: Path) -> list[Record]:
+    """What the recorder wrote beside a part: its record, then the others. One empty record: nothing."""
+    try:
+        records = list(read(path.with_suffix(".blocks.jsonl")))
+    except OSError:
+        return [{}]
+    if not records or records[0].get("type") != "part":
+        return [{}]
+    return records
+
+
+def _utc_of_0_ns(part: Record) -> int | None:
+    """UTC since 1970 when the clock of a part was 0."""
+    try:
+        utc = datetime.fromisoformat(part["utc"])
+        return round(utc.timestamp() * 1e9) - int(part["t_ns"])
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _is_block(record: Record) -> bool:
+    return record.get("type") == "block" and all(type(record.get(k)) is int for k in ("rows", "origin_ns"))
+
+
+def _is_gap(record: Record) -> bool:
+    return record.get("type") == "gap" and type(record.get("overruns")) is int
+
+
+def _rows(file: soundfile.SoundFile, path: Path, most: int, done: int) -> list[Array]:
+    """One array (n, channels) of the next rows; an empty list at the end."""
+    try:
+        rows = file.read(max(most, 1), dtype="float32", always_2d=True)
+    except soundfile.LibsndfileError as error:
+        raise SourceError(f"{path}: damaged after {done / file.samplerate:.1f} s") from error
+    return [rows] if len(rows) else []
 
 
 @contextmanager
-def _opened_wav(path: Path | str, settings: Settings) -> Iterator[soundfile.SoundFile]:
+def _opened_wav(path: Path, settings: Settings, *, tell: bool = True) -> Iterator[soundfile.SoundFile]:
     audio = settings.audio
     try:
-        if not Path(path).is_file():
-            raise SourceError(
-                f"{path}: {'is not a file' if Path(path).exists() else 'there is no such file'}"
-            )
-        if Path(path).stat().st_size == 0:
+        if not path.is_file():
+            raise SourceError(f"{path}: {'is not a file' if path.exists() else 'there is no such file'}")
+        if path.stat().st_size == 0:
             raise SourceError(f"{path}: is empty (0 bytes)")
-        Path(path).open("rb").close()
+        path.open("rb").close()
         file = soundfile.SoundFile(path)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror}") from error
@@ -444,14 +595,10 @@ def _opened_wav(path: Path | str, settings: Settings) -> Iterator[soundfile.Soun
                 f"{path}: has {file.channels} channel{'s' * (file.channels > 1)}, but audio.channel_map "
                 f"names channel {max(audio.channel_map)} (counted from 0)"
             )
-        _tell_of_the_header(file, path)
-        seconds = file.frames / file.samplerate
-        if seconds < audio.frame / audio.rate_hz:
-            raise SourceError(
-                f"{path}: holds {seconds:.3g} s, less than one frame ({audio.frame / audio.rate_hz:.3g} s)"
-            )
-        if file.channels > len(audio.channel_map):
-            log.info("%s: channels %s of %d are used", path, list(audio.channel_map), file.channels)
+        if tell:
+            _tell_of_the_header(file, path)
+            if file.channels > len(audio.channel_map):
+                log.info("%s: channels %s of %d are used", path, list(audio.channel_map), file.channels)
         yield file
 
 

@@ -135,7 +135,7 @@ async def hung(settings, control):
     """A driver that does not return from a read."""
     asleep = []
 
-    def capture(stream, settings, wait, now_ns=time.monotonic_ns):
+    def capture(stream, settings, wait, now_ns=time.monotonic_ns, tap=None):
         asleep.append(True)
         time.sleep(1.5)
         yield from ()

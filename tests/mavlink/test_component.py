@@ -10,15 +10,18 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
 
+from locagen_edge.geodesy import moved
 from locagen_edge.mavlink import component as voice
+from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.settings import MavlinkSettings
-from locagen_edge.types import Track, TrueBearing
+from locagen_edge.types import Pose, Position, Track, TrueBearing
 
 TICK_S = 0.0512  # the pipeline's hop
 TRACK = Track(
@@ -39,11 +42,14 @@ DEAF = replace(CALLING, hearing=False)
 
 
 def decode(frames: list[bytes]) -> list[Any]:
-    """What pymavlink's own parser, our peer here, reads in these frames."""
+    """What pymavlink's own parser, our peer here, reads in these frames; what it does not know, ours."""
     peer = common.MAVLink(None)
     messages = [message for frame in frames for message in peer.parse_buffer(frame) or ()]
     assert len(messages) == len(frames)
-    return messages
+    return [
+        dialect.decode(frame) if message.get_type().startswith("UNKNOWN") else message
+        for frame, message in zip(frames, messages, strict=True)
+    ]
 
 
 def speak(
@@ -76,6 +82,24 @@ def heartbeat(
     return bytes(message.pack(common.MAVLink(None, system, component)))
 
 
+def position(caller: int = 0, **more: Any) -> Position:
+    """40 m north and 30 m east of AWAY."""
+    lat, lon, _ = moved(47.0, 8.0, 0.0, np.array([40.0, 30.0, 0.0]))
+    values: dict[str, Any] = {
+        "t_ns": 0, "caller": caller, "range_observable": True, "latitude_deg": lat, "longitude_deg": lon,
+        "altitude_m": 401.5, "covariance_m2": np.array([[60.0, 5.0], [5.0, 9.0]]), "semi_major_m": 7.8,
+        "semi_minor_m": 2.9, "orientation_rad": 0.1, "azimuth_rad": 0.64, "azimuth_sigma_rad": 0.05,
+        "age_s": 0.3, "looks": 12,
+    }  # fmt: skip
+    return Position(**{**values, **more})
+
+
+AWAY = Pose(2_000_000_000, (1.0, 0.0, 0.0, 0.0), 47.0, 8.0, 420.0, 20.0, 1.0)
+PLACED = replace(
+    CALLING, track=IN_EARTH, positions=(position(),), pose=AWAY, t_ns=AWAY.t_ns, noise_dbfs=-41.0
+)
+
+
 # --- heartbeat ----------------------------------------------------------------------------------------
 
 
@@ -99,7 +123,7 @@ def test_the_heartbeat_stops_with_the_hearing_and_returns_with_it_at_once() -> N
     said(component, QUIET, 10)
     assert said(component, DEAF, 10, 10.0) == []
     first = component.due(20.3, QUIET)
-    assert [m.get_type() for m in decode(first)] == ["HEARTBEAT"]
+    assert [m.get_type() for m in decode(first)] == ["HEARTBEAT", "LOCAGEN_BEARING", "TUNNEL"]
 
 
 def test_a_microphone_fault_shows_in_the_heartbeat_while_it_lasts() -> None:
@@ -430,7 +454,7 @@ STATUSES = st.builds(
 
 
 @given(st.lists(STATUSES, max_size=30), st.binary(max_size=300))
-def test_only_five_messages_leave_unasked(statuses: list[Status], noise: bytes) -> None:
+def test_only_these_messages_ever_leave(statuses: list[Status], noise: bytes) -> None:
     component = Component(MavlinkSettings())
     ids: Counter[int] = Counter()
     for k, status in enumerate(statuses):
@@ -438,8 +462,90 @@ def test_only_five_messages_leave_unasked(statuses: list[Status], noise: bytes) 
         messages = decode(component.due(k * 0.4, status))
         ids.update(m.get_msgId() for m in messages)
         assert all(m.command == 511 for m in messages if m.get_msgId() == 76)  # SET_MESSAGE_INTERVAL
-    assert set(ids) <= {0, 76, 111, 251, 253}
+    assert set(ids) <= {0, 76, 111, 251, 253, 385, 59500, 59501}
     assert sum(ids.values()) == sum(component.sent.values())
+
+
+# --- places -------------------------------------------------------------------------------------------
+
+
+def test_a_call_without_a_place_is_told_again_once_it_has_one() -> None:
+    component = Component(MavlinkSettings())
+    first = texts(said(component, replace(PLACED, positions=()), 3))
+    assert first == ["Call heard: 012 deg true, 042 from nose, +-4 deg"]
+    assert texts(said(component, PLACED, 10, 3.0)) == ["Call heard: 012 deg true, 50 m +-8 m"]
+    component.say_again()
+    assert texts(said(component, PLACED, 10, 13.0)) == ["Call heard: 012 deg true, 50 m +-8 m"]
+
+
+def test_no_place_is_told_where_the_range_is_not_observable() -> None:
+    nowhere = position(range_observable=False, latitude_deg=None, longitude_deg=None, altitude_m=None)
+    messages = said(Component(MavlinkSettings()), replace(PLACED, positions=(nowhere,)), 5)
+    assert not any(m.get_type() == "LOCAGEN_POSITION" for m in messages)
+    assert not any(" m +-" in text for text in texts(messages))
+
+
+def test_the_records_say_what_is_known() -> None:
+    messages = said(Component(MavlinkSettings(send_tunnel=False), start_s=0.5), PLACED, 5)
+    bearing = next(m for m in messages if m.get_type() == "LOCAGEN_BEARING")
+    assert bearing.time_usec == 1_500_000
+    assert (bearing.lat, bearing.lon, bearing.alt, bearing.height) == (470_000_000, 80_000_000, 420_000, 20)
+    assert bearing.azimuth_true == pytest.approx(12.0)
+    assert (bearing.snr, bearing.noise_level) == (6.0, -41.0)
+    place = [m for m in messages if m.get_type() == "LOCAGEN_POSITION"][-1]
+    assert place.time_usec == 1_500_000
+    assert place.lat * 1e-7 == pytest.approx(position().latitude_deg, abs=1e-7)
+    assert (place.alt, place.looks) == (401_500, 12)
+    assert (place.covariance_nn, place.covariance_ne, place.covariance_ee) == (60.0, 5.0, 9.0)
+    flags = dialect.messages
+    assert place.flags == (
+        flags.LOCAGEN_POSITION_FLAGS_ALTITUDE_VALID
+        | flags.LOCAGEN_POSITION_FLAGS_ON_GROUND
+        | flags.LOCAGEN_POSITION_FLAGS_CONFIRMED
+    )
+
+
+def test_every_confirmed_caller_has_a_record_and_values_are_of_the_best() -> None:
+    others = (replace(IN_EARTH, id=7), replace(IN_EARTH, id=8, confidence=0.1))
+    status = replace(PLACED, others=others, positions=(position(7), position(8)))
+    messages = said(Component(MavlinkSettings()), status, 5)
+    assert {m.event_id for m in messages if m.get_type() == "LOCAGEN_BEARING"} == {0, 7}
+    assert {m.event_id for m in messages if m.get_type() == "LOCAGEN_POSITION"} == {7}
+
+
+@pytest.mark.parametrize("ways", [(), ("message",), ("tunnel",), ("message", "tunnel")])
+def test_the_settings_choose_how_records_go(ways: tuple[str, ...]) -> None:
+    messages = said(
+        Component(MavlinkSettings(send_records="message" in ways, send_tunnel="tunnel" in ways)), PLACED, 5
+    )
+    kinds = {m.get_type() for m in messages}
+    assert ({"LOCAGEN_BEARING", "LOCAGEN_POSITION"} <= kinds) == ("message" in ways)
+    assert ("TUNNEL" in kinds) == ("tunnel" in ways)
+    if len(ways) == 2:
+        inside = [dialect.untunnel(m).to_dict() for m in messages if m.get_type() == "TUNNEL"]
+        assert inside == [m.to_dict() for m in messages if m.get_type().startswith("LOCAGEN")]
+
+
+def test_that_nothing_is_heard_is_told_once_a_second_and_by_the_deaf_never() -> None:
+    component = Component(MavlinkSettings(send_tunnel=False))
+    quiet = [m for m in said(component, QUIET, 10) if m.get_type() == "LOCAGEN_BEARING"]
+    assert len(quiet) == 10
+    assert all(m.flags & dialect.messages.LOCAGEN_BEARING_FLAGS_NOTHING_HEARD for m in quiet)
+    assert all(m.event_id == 0 and math.isnan(m.azimuth_body) for m in quiet)
+    assert said(component, DEAF, 10, 10.0) == []
+
+
+@given(
+    st.floats(-90, 90), st.floats(-180, 180), st.floats(0, 1e9), st.floats(-400, 9000) | st.none(),
+    st.floats(allow_nan=True, allow_infinity=True),
+)  # fmt: skip
+def test_no_place_breaks_the_line_or_the_wire(
+    lat: float, lon: float, sigma: float, alt: float | None, age: float
+) -> None:
+    place = position(latitude_deg=lat, longitude_deg=lon, semi_major_m=sigma, altitude_m=alt, age_s=age)
+    messages = said(Component(MavlinkSettings()), replace(PLACED, positions=(place,)), 1)
+    assert any(m.get_type() == "LOCAGEN_POSITION" for m in messages)
+    assert all(len(text) <= 50 for text in texts(messages))
 
 
 def test_sent_counts_by_name() -> None:
@@ -448,6 +554,8 @@ def test_sent_counts_by_name() -> None:
     assert component.sent == {
         "HEARTBEAT": 10,
         "STATUSTEXT": 1,
+        "LOCAGEN_BEARING": 20,
+        "TUNNEL": 20,
         **dict.fromkeys(("LG_AZB", "LG_EL", "LG_SIG", "LG_CONF", "LG_SNR"), 20),
     }
 

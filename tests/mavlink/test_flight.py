@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,7 +25,7 @@ from locagen_edge.mavlink.framer import Framer
 from locagen_edge.mavlink.parameters import NAMES
 from locagen_edge.mavlink.targets import Place, adsb_vehicle, camera_target
 from locagen_edge.settings import FlightSettings, MavlinkSettings, Settings
-from locagen_edge.types import TrueBearing
+from locagen_edge.types import Position, TrueBearing
 
 ROI, YAW = common.MAV_CMD_DO_SET_ROI_LOCATION, common.MAV_CMD_CONDITION_YAW
 GUIDED, LOITER, STABILIZE = 4, 5, 0
@@ -55,7 +56,32 @@ EVER = set(ALWAYS) | {75} | set().union(*SWITCHED.values())
 
 TRACK = replace(IN_EARTH, id=3, confirmed=True)
 PLACE = Place(3, 47.1, 8.2, 450.0, 12.0, 1.0)
-HEARD = replace(CALLING, track=TRACK, places=(PLACE,))
+
+
+def positions(*places: Place) -> tuple[Position, ...]:
+    """As the pipeline tells them."""
+    return tuple(
+        Position(
+            t_ns=0,
+            caller=p.event_id,
+            range_observable=True,
+            latitude_deg=p.latitude_deg,
+            longitude_deg=p.longitude_deg,
+            altitude_m=p.altitude_m,
+            covariance_m2=np.diag([100.0, 144.0]),
+            semi_major_m=p.sigma_m,
+            semi_minor_m=10.0,
+            orientation_rad=0.0,
+            azimuth_rad=0.0,
+            azimuth_sigma_rad=0.1,
+            age_s=p.age_s,
+            looks=9,
+        )
+        for p in places
+    )
+
+
+HEARD = replace(CALLING, track=TRACK, positions=positions(PLACE))
 
 
 def autopilot(
@@ -121,7 +147,7 @@ def test_every_message_that_leaves_is_let_out_by_a_switch(on: tuple[bool, ...]) 
     allowed = set(ALWAYS).union(*(SWITCHED[name] for name, is_on in switches.items() if is_on))
     assert ids <= allowed, sorted(ids - allowed)
     assert set(ALWAYS) <= ids
-    for name in ("send_adsb", "send_camera_target", "send_computer_status"):
+    for name in SWITCHED:
         assert (SWITCHED[name] <= ids) == switches[name]
     assert asked == {511}, "MAV_CMD_SET_MESSAGE_INTERVAL, and nothing that acts on flight"
 
@@ -236,7 +262,7 @@ def test_a_place_is_pointed_at_to_the_metre() -> None:
     ((_, roi),) = commands(left(component, autopilot(), HEARD, 30))
     assert (roi.get_type(), roi.command) == ("COMMAND_INT", ROI)
     assert (roi.x, roi.y, roi.z, roi.frame) == (471_000_000, 82_000_000, 450.0, common.MAV_FRAME_GLOBAL)
-    level = replace(HEARD, places=(replace(PLACE, altitude_m=None),))
+    level = replace(HEARD, positions=positions(replace(PLACE, altitude_m=None)))
     ((_, roi),) = commands(left(component_of(settings_with(BOTH)), autopilot(), level, 30))
     assert (roi.z, roi.frame) == (0.0, common.MAV_FRAME_GLOBAL_RELATIVE_ALT)
 
@@ -244,7 +270,7 @@ def test_a_place_is_pointed_at_to_the_metre() -> None:
 @pytest.mark.parametrize("place", [replace(PLACE, latitude_deg=math.nan), replace(PLACE, age_s=60.0)])
 def test_a_place_that_is_none_is_not_pointed_at(place: Place) -> None:
     only_roi = settings_with(FlightSettings(roi=True))
-    heard = replace(HEARD, places=(place,))
+    heard = replace(HEARD, positions=positions(place))
     assert commands(left(component_of(only_roi), autopilot(), heard, 30)) == []
 
 
@@ -252,7 +278,7 @@ def test_px4_gets_roi_in_hold_and_no_yaw() -> None:
     hold = replace(BOTH, modes=("HOLD",))
     ((_, roi),) = commands(left(component_of(settings_with(hold)), autopilot(PX4_HOLD, kind=12), HEARD, 30))
     assert roi.command == ROI
-    no_place = replace(HEARD, places=())
+    no_place = replace(HEARD, positions=())
     assert commands(left(component_of(settings_with(hold)), autopilot(PX4_HOLD, kind=12), no_place, 30)) == []
 
 
@@ -292,4 +318,4 @@ def test_a_target_is_where_it_is_from_the_vehicle() -> None:
 @given(st.builds(Place, st.integers(), *[st.floats()] * 2, st.none() | st.floats(), st.floats(), st.floats()))
 def test_no_place_raises(place: Place) -> None:
     settings = settings_with(BOTH, send_adsb=True, send_camera_target=True)
-    list(left(component_of(settings), autopilot(), replace(HEARD, places=(place,)), 1))
+    list(left(component_of(settings), autopilot(), replace(HEARD, positions=positions(place)), 1))

@@ -1,0 +1,1 @@
+"""What is kept on disk: recordings, and the black box. Bounded, and whole after a loss of power."""
