@@ -173,11 +173,21 @@ int locagen_steer_hear(locagen_steer *state, int32_t span, float share);
  * white, and its level from what R_x holds across its best direction (M - 1 of M dimensions). */
 int locagen_steer_search(locagen_steer *state, int32_t span, int32_t most, float least, locagen_source *out);
 
-/* Keeps in mind how far q strayed from 1 in the last search, in each direction of the grid and each part of
- * the band; while nothing calls. From then on T is there so much smaller: 1 / (E (q - 1)^2 * bins averaged), which
- * is T itself where the noise keeps still. So a score means the same under rotors that hum and under rotors
- * that hunt: a constant false-alarm rate. */
-int locagen_steer_watch(locagen_steer *state, int32_t span, float share);
+/* Puts aside how far q strayed from 1 in the last search, in each direction of the grid and each part of the
+ * band; while nothing calls. */
+int locagen_steer_watch(locagen_steer *state, int32_t span);
+
+/* Now and then, say every half second, while nothing calls: keeps in mind what was put aside before the last
+ * settle, with this share of each search; by now a call that began then would be known as one. What is kept in mind
+ * lessens T in each direction and part of the band to 1 / (E (q - 1)^2 * bins averaged), which is T itself where
+ * the noise keeps still. So a score means the same under rotors that hum and under rotors that hunt: a constant
+ * false-alarm rate. */
+int locagen_steer_settle(locagen_steer *state, int32_t span, float share);
+
+/* Instead of watch, while something may call: drops what was put aside, and of the last search keeps in mind
+ * as much as is at most `most` times what is usual there: little of a call, but noise that is taken for calls
+ * again and again ceases to be. */
+int locagen_steer_doubt(locagen_steer *state, int32_t span, float share, float most);
 
 /* Weights 0 to 1 of all bins, for the searches to come: each bin counts as so many looks less. */
 int locagen_steer_weigh(locagen_steer *state, const float *weight);

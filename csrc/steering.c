@@ -223,6 +223,8 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
         span->scores = locagen_take(a, groups * DIRECTIONS);
         span->over = locagen_take(a, groups * DIRECTIONS * (size_t)s->coarse.bins);
         span->spread = locagen_take(a, groups * DIRECTIONS * (size_t)s->coarse.bins);
+        for (int i = 0; i < 2; i++)
+            span->aside[i] = locagen_take(a, groups * DIRECTIONS * (size_t)s->coarse.bins);
     }
     s->grid_u = (double *)(void *)locagen_take(a, 2 * 3 * groups * DIRECTIONS);
 }
@@ -349,6 +351,8 @@ int locagen_steer_reset(locagen_steer *memory)
         locagen_span *span = &s->span[n];
         memset(span->signal, 0, mics * mics * row);
         memset(span->scores, 0, groups), memset(span->over, 0, blocks), memset(span->spread, 0, blocks);
+        memset(span->aside[0], 0, blocks), memset(span->aside[1], 0, blocks);
+        memset(span->aside_count, 0, sizeof span->aside_count);
         memset(span->lost, 0, sizeof span->lost), memset(span->heard_weights, 0, sizeof span->heard_weights);
         span->heard = span->heard_variance = span->watched = 0;
     }
@@ -425,20 +429,6 @@ int locagen_steer_hear(locagen_steer *memory, int32_t span, float share)
     return LOCAGEN_OK;
 }
 
-int locagen_steer_watch(locagen_steer *memory, int32_t span, float share)
-{
-    if (memory == NULL)
-        return LOCAGEN_E_NULL;
-    steer *s = state_of(memory);
-    locagen_span *x = span_of(s, span);
-    if (x == NULL)
-        return LOCAGEN_E_SPAN;
-    if (!within(share, 0, 1))
-        return LOCAGEN_E_SHARE;
-    s->paths->watch(groups_of(s) * (long)DIRECTIONS * s->coarse.bins, share, x->over, x->spread);
-    x->watched = (double)(1.0f - share) * x->watched + (double)share;
-    return LOCAGEN_OK;
-}
 
 int locagen_steer_weigh(locagen_steer *memory, const float *weight)
 {
@@ -480,6 +470,19 @@ static double looks(const steer *s, const locagen_span *x)
     return signal * noise / (signal + noise);
 }
 
+/* Bins that each q of the grid is an average of. */
+static double averaged(const steer *s)
+{
+    return (2 * s->coarse.half + 1) * (double)s->coarse.thinning;
+}
+
+/* What theory is worth beside what was watched. */
+static double prior_of(const steer *s, const locagen_span *x)
+{
+    double fresh = s->looks / looks_of(s, x->heard, x->heard_variance); /* of each hop's q, what is new */
+    return PRIOR_LOOKS / fresh * WATCH_SHARE;
+}
+
 /* How far q has spread, against theory's 1 / (looks * bins averaged), as a rate and an offset that theory
  * adds to what was watched: see locagen_spread. */
 static locagen_spread spread_of(const steer *s, locagen_span *x)
@@ -487,13 +490,76 @@ static locagen_spread spread_of(const steer *s, locagen_span *x)
     locagen_spread spread = {.over = x->over};
     if (x->watched <= 0 || s->learnt <= 0)
         return spread;
-    double averaged = (2 * s->coarse.half + 1) * (double)s->coarse.thinning;
-    double fresh = s->looks / looks_of(s, x->heard, x->heard_variance); /* of each hop's q, what is new */
-    double prior = PRIOR_LOOKS / fresh * WATCH_SHARE, total = x->watched + prior;
+    double prior = prior_of(s, x), total = x->watched + prior;
     spread.spread = x->spread;
-    spread.rate = (float)(looks(s, x) * averaged / total);
+    spread.rate = (float)(looks(s, x) * averaged(s) / total);
     spread.offset = (float)(prior / total);
     return spread;
+}
+
+/* Numbers in `over` and all that is made of it. */
+static long spread_count(const steer *s)
+{
+    return groups_of(s) * (long)DIRECTIONS * s->coarse.bins;
+}
+
+int locagen_steer_watch(locagen_steer *memory, int32_t span)
+{
+    if (memory == NULL)
+        return LOCAGEN_E_NULL;
+    steer *s = state_of(memory);
+    locagen_span *x = span_of(s, span);
+    if (x == NULL)
+        return LOCAGEN_E_SPAN;
+    s->paths->add_squares(spread_count(s), x->over, x->aside[0]);
+    x->aside_count[0]++;
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_settle(locagen_steer *memory, int32_t span, float share)
+{
+    if (memory == NULL)
+        return LOCAGEN_E_NULL;
+    steer *s = state_of(memory);
+    locagen_span *x = span_of(s, span);
+    if (x == NULL)
+        return LOCAGEN_E_SPAN;
+    if (!within((double)share, 0, 1))
+        return LOCAGEN_E_SHARE;
+    float *done = x->aside[1];
+    if (x->aside_count[1] > 0) {
+        double keep = pow(1 - (double)share, x->aside_count[1]);
+        s->paths->blend(spread_count(s), (float)keep, (float)((1 - keep) / x->aside_count[1]), done, x->spread);
+        x->watched = keep * x->watched + 1 - keep;
+        memset(done, 0, (size_t)spread_count(s) * sizeof *done);
+    }
+    x->aside[1] = x->aside[0], x->aside_count[1] = x->aside_count[0];
+    x->aside[0] = done, x->aside_count[0] = 0;
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_doubt(locagen_steer *memory, int32_t span, float share, float most)
+{
+    if (memory == NULL)
+        return LOCAGEN_E_NULL;
+    steer *s = state_of(memory);
+    locagen_span *x = span_of(s, span);
+    if (x == NULL)
+        return LOCAGEN_E_SPAN;
+    if (!within((double)share, 0, 1) || !within((double)most, 0, 1e6))
+        return LOCAGEN_E_SHARE;
+    for (int i = 0; i < 2; i++)
+        if (x->aside_count[i] > 0) {
+            memset(x->aside[i], 0, (size_t)spread_count(s) * sizeof *x->aside[i]);
+            x->aside_count[i] = 0;
+        }
+    if (x->heard <= 0 || s->learnt <= 0)
+        return LOCAGEN_OK;
+    double usual = x->watched + prior_of(s, x), theory = prior_of(s, x) / (looks(s, x) * averaged(s));
+    s->paths->blend_squares(spread_count(s), share, (float)((double)most / usual),
+                            (float)((double)most * theory / usual), x->over, x->spread);
+    x->watched = (double)(1.0f - share) * x->watched + (double)share;
+    return LOCAGEN_OK;
 }
 
 /* What the bins are worth: looks, times the weight from outside. */

@@ -37,6 +37,8 @@ typedef struct {
     float *scores;              /* of the grid, in the last search */
     float *over, *spread;       /* [vector of directions][coarse bin][lane]: q - 1 where above 0, in the last
                                  * search; twice its mean square times the sum of the weights */
+    float *aside[2];            /* sums of such squares, since settle and before */
+    int32_t aside_count[2];
 } locagen_span;
 
 struct locagen_steer_paths;
@@ -102,7 +104,10 @@ typedef struct locagen_steer_paths {
     int32_t width;              /* lanes */
     int (*listen)(steer *s, const float *in, float *power);
     void (*add)(const steer *s, int32_t slot, float keep, float share, float *matrix);
-    void (*watch)(long count, float share, const float *over, float *spread);
+    void (*add_squares)(long count, const float *over, float *sum);
+    void (*blend)(long count, float keep, float share, const float *from, float *to);
+    void (*blend_squares)(long count, float share, float rate, float offset, const float *over,
+                          float *spread);
     void (*invert)(const steer *s, const locagen_whitening *how);
     void (*whiten)(const steer *s, const locagen_whitening *how);
     void (*score)(const steer *s, const locagen_response *r, enum locagen_measure measure,

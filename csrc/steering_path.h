@@ -114,13 +114,28 @@ STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const 
     store(mean_q, plain * (1.0f / (float)bins));
 }
 
-/* Half of the deviations from 1, those above it, stand for all. */
-STEP void watch(long count, float share, const float *over, float *spread)
+/* to <- keep to + share from */
+STEP void blend(long count, float keep, float share, const float *from, float *to)
 {
-    float keep = 1.0f - share, twice = 2.0f * share;
+    for (long n = 0; n < count; n += WIDTH)
+        store(to + n, keep * load(to + n) + share * load(from + n));
+}
+
+/* Half of the deviations from 1, those above it, stand for all. */
+STEP void add_squares(long count, const float *over, float *sum)
+{
     for (long n = 0; n < count; n += WIDTH) {
         vec x = load(over + n);
-        store(spread + n, keep * load(spread + n) + twice * x * x);
+        store(sum + n, load(sum + n) + 2.0f * x * x);
+    }
+}
+
+/* The squares themselves, none more than `rate` times what is there, plus `offset`. */
+STEP void blend_squares(long count, float share, float rate, float offset, const float *over, float *spread)
+{
+    for (long n = 0; n < count; n += WIDTH) {
+        vec x = load(over + n), old = load(spread + n), most = rate * old + offset;
+        store(spread + n, (1.0f - share) * old - share * larger(-2.0f * x * x, -most));
     }
 }
 

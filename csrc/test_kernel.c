@@ -579,7 +579,10 @@ static void test_steered_spans(const locagen_steer_paths *chosen)
     locagen_steer_hear(b.kernel, 1, 1.0f);
     CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "span 0 has heard nothing");
     CHECK(locagen_steer_search(b.kernel, 1, 1, 0, b.sources) == 1, "span 1 has");
-    CHECK(locagen_steer_watch(b.kernel, 1, 0.1f) == 0, "watched");
+    for (int n = 0; n < 2; n++) {
+        CHECK(locagen_steer_watch(b.kernel, 1) == 0, "watched");
+        CHECK(locagen_steer_settle(b.kernel, 1, 0.1f) == 0, "settled");
+    }
     add_wave(&b, 1.0, -0.5, 0.1f);
     locagen_steer_listen(b.kernel, b.in, b.power);
     locagen_steer_hear(b.kernel, 0, 1.0f), locagen_steer_hear(b.kernel, 1, 1.0f);
@@ -722,12 +725,17 @@ static void test_steered_refusals(void)
     CHECK(locagen_steer_search(b.kernel, 0, 1, NAN, b.sources) == LOCAGEN_E_LEAST, "least");
     for (int span = -1; span <= 2; span += 3) {
         CHECK(locagen_steer_hear(b.kernel, span, 0.5f) == LOCAGEN_E_SPAN, "span %d", span);
-        CHECK(locagen_steer_watch(b.kernel, span, 0.5f) == LOCAGEN_E_SPAN, "span %d", span);
+        CHECK(locagen_steer_watch(b.kernel, span) == LOCAGEN_E_SPAN, "span %d", span);
+        CHECK(locagen_steer_settle(b.kernel, span, 0.5f) == LOCAGEN_E_SPAN, "span %d", span);
+        CHECK(locagen_steer_doubt(b.kernel, span, 0.5f, 3.0f) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_search(b.kernel, span, 1, 0, b.sources) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_map(b.kernel, span, b.map) == LOCAGEN_E_SPAN, "span %d", span);
     }
-    CHECK(locagen_steer_watch(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
-    CHECK(locagen_steer_watch(b.kernel, 0, NAN) == LOCAGEN_E_SHARE, "no share");
+    CHECK(locagen_steer_watch(NULL, 0) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_settle(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_settle(b.kernel, 0, NAN) == LOCAGEN_E_SHARE, "no share");
+    CHECK(locagen_steer_doubt(NULL, 0, 0.5f, 3.0f) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_doubt(b.kernel, 0, 0.5f, NAN) == LOCAGEN_E_SHARE, "no limit");
     CHECK(locagen_steer_weigh(NULL, b.in) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_weigh(b.kernel, NULL) == LOCAGEN_E_NULL, "no weights");
     b.in[1] = 1.01f;

@@ -34,7 +34,7 @@ from locagen_edge.stages.correlation import Correlator
 from locagen_edge.stages.faults import symptoms
 from locagen_edge.stages.mic import wav_frames
 from locagen_edge.stages.tdoa import PeakPicker
-from locagen_edge.types import F64, Bearing, Correlation, Tdoa
+from locagen_edge.types import F64, Correlation, Tdoa
 
 MOST_FRAMES = 3000
 """Of a longer recording they are taken evenly: 3000 settle 0.02 mm, and bound memory on a small board."""
@@ -47,9 +47,6 @@ CLOSURE = 0.25
 
 NEGATIVE = 0.8
 """Share of the frames in which an inverted channel's trough is deeper than its peak is high."""
-
-UNJUDGED = Bearing(None, math.pi, None, math.pi, 0.0, "")
-"""For `symptoms`: whether delays fit a direction is what is to be found out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +89,7 @@ def hear(path: Path, settings: Settings, margin: float) -> Heard:
         frames += 1
         correlation = correlate(frame)
         tdoa = pick(correlation)
-        wrong = symptoms(frame, correlation, tdoa, UNJUDGED)
+        wrong = symptoms(frame, correlation, tdoa, misfit=0.0)  # positions are what is asked for
         faults.update(wrong)
         troughs.append(_trough(correlation))
         if not wrong and np.all(np.isfinite(tdoa.delay_s)):

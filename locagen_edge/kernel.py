@@ -164,8 +164,8 @@ class Source:
 class Steered:
     """Maximum likelihood over directions, with the noise's own cross-spectra.
 
-    For each frame: `listen`, then `hear` and `search`, for each span; then, while nothing calls, `learn` and
-    `watch`. Score and sources: `csrc/locagen.h`.
+    For each frame: `listen`, then `hear` and `search`, for each span; then, while nothing calls, `learn`,
+    `watch` and now and then `settle`. Score and sources: `csrc/locagen.h`.
 
     Args:
         positions_m: microphones, shape `(mics, 3)`, FRD, metres; 2 to 8 of them.
@@ -295,9 +295,20 @@ class Steered:
         """The same for the signal's matrix of a span, with the last frame; 1: this frame alone."""
         _check(lib.locagen_steer_hear(self._state, span, share))
 
-    def watch(self, share: float, span: int = 0) -> None:
-        """Keeps in mind how the noise strayed in the last search, for scores that mean the same in all."""
-        _check(lib.locagen_steer_watch(self._state, span, share))
+    def watch(self, span: int = 0) -> None:
+        """Puts aside how the noise strayed in the last search."""
+        _check(lib.locagen_steer_watch(self._state, span))
+
+    def settle(self, share: float, span: int = 0) -> None:
+        """Keeps in mind what was put aside before the last time, so that scores mean the same in all noise.
+
+        `share`: of each search.
+        """
+        _check(lib.locagen_steer_settle(self._state, span, share))
+
+    def doubt(self, share: float, most: float, span: int = 0) -> None:
+        """Instead of `watch`, while something may call: drops what was put aside, keeps little in mind."""
+        _check(lib.locagen_steer_doubt(self._state, span, share, most))
 
     def weigh(self, weight: npt.NDArray[np.float32]) -> None:
         """Weights 0 to 1 of all bins in the band, float32, shape `(bins,)`, for the searches to come."""
@@ -306,8 +317,9 @@ class Steered:
     def search(self, max_sources: int = 1, span: int = 0, least: float = 0.0) -> tuple[Source, ...]:
         """The sources in the span's matrix, strongest first; at most one less than there are microphones.
 
-        None before `hear`, in silence and with less than two microphones; none that scores `least` or less. Where nothing was learnt the noise
-        is taken for white, and its level from what is across the best direction.
+        None before `hear`, in silence and with less than two microphones; none that scores `least` or less.
+        Where nothing was learnt the noise is taken for white, and its level from what is across the best
+        direction.
         """
         room = min(max_sources, _MOST_MICS)
         found = _check(lib.locagen_steer_search(self._state, span, room, least, self._sources))
@@ -365,7 +377,7 @@ def _grid(positions_m: npt.NDArray[np.float64], waves_per_m: float) -> tuple[int
     return min(180, rows if flat else 2 * rows), columns
 
 
-def _pointer(samples: npt.NDArray[np.float32], shape: tuple[int, int]) -> Any:
+def _pointer(samples: npt.NDArray[np.float32], shape: tuple[int, ...]) -> Any:
     """What C may read from: everything is checked before."""
     try:
         # Comparing types by identity first: the comparison by value takes longer than the rest.

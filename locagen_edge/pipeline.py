@@ -36,7 +36,7 @@ class Pipeline:
         self._hop_s = settings.hop_s
         self._correlate, self._pick, self._locate = _made_for_array(settings)
         self._detect = Detector(settings.detection)
-        self._find_faults = FaultFinder()
+        self._find_faults = FaultFinder(settings)
         self._tolerance_rad = tolerance_rad(array, settings.array.tolerance_m)
         self._positioner = Positioner(settings.position)
         self._track = Tracker(
@@ -60,6 +60,7 @@ class Pipeline:
             raise SettingsError("audio: cannot be changed while sound comes in")
         if _for_array(settings) != _for_array(self._settings):
             self._correlate, self._pick, self._locate = _made_for_array(settings)
+            self._find_faults.apply(settings)
         self._settings = settings
         self._locate.apply(settings)
         self._detect.apply(settings.detection)
@@ -83,10 +84,10 @@ class Pipeline:
         self._last_ns = frame.t_ns
         correlation = self._correlate(frame)
         tdoa = self._pick(correlation)
-        bearing = self._locate(frame, tdoa)
-        detection = self._detect(correlation, bearing, elapsed_s)
+        bearings = self._locate(frame, tdoa, elapsed_s)
+        detection = self._detect(correlation, bearings[0], elapsed_s)
         self._locate.settle(detection.call)
-        tracks = self._track((bearing,), detection, elapsed_s, pose.attitude if pose else None)
+        tracks = self._track(bearings, detection, elapsed_s, pose.attitude if pose else None)
         sightings = tuple(self._looks(tracks, pose))
         positions = (self._positioner.position(t.id, frame.middle_ns) for t in tracks if t.confirmed)
         return Estimate(
@@ -94,10 +95,10 @@ class Pipeline:
             start=frame.start,
             overruns=frame.overruns,
             tdoa=tdoa,
-            bearing=bearing,
+            bearing=bearings[0],
             detection=detection,
             track=tracks[0] if tracks else None,
-            faults=self._find_faults(frame, correlation, tdoa, bearing, elapsed_s),
+            faults=self._find_faults(frame, correlation, tdoa, elapsed_s),
             truth=frame.truth,
             tracks=tracks,
             pose=pose,
@@ -132,5 +133,5 @@ def _made_for_array(settings: Settings) -> tuple[Correlator, PeakPicker, Locator
 def _for_array(settings: Settings) -> tuple[Any, ...]:
     """What those tables are made of: all that their stages read, less what `Locator.apply` takes."""
     s = settings
-    steered = replace(s.steered, score=0.0, forget_s=1.0)
+    steered = replace(s.steered, span_s=1.0, forget_s=1.0)
     return s.array, s.environment, s.correlation, s.bearing, s.models, steered

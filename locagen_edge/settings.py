@@ -230,17 +230,18 @@ class BearingSettings:
     """From delays to a direction."""
 
     estimator: str = setting(
-        "far-field",
-        "`far-field`: least squares over all pairs. `hyperbolic`: the paper's solver, with a position. "
-        "`two-mic`: arcsin of the first pair alone. `model:NAME`: a learned one from the models directory. "
-        "`steered`: greatest likelihood over directions, with the noise's own matrix divided out.",
+        "steered",
+        "`steered`: greatest likelihood over directions, with the noise's own matrix divided out. "
+        "`far-field`: least squares over the delays of all pairs. `hyperbolic`: the paper's solver, with a "
+        "position. `two-mic`: arcsin of the first pair alone. `model:NAME`: a learned one from the models "
+        "directory.",
         pattern=rf"far-field|hyperbolic|two-mic|steered|model:{NAME}",
     )
 
 
 @dataclass(frozen=True)
 class SteeredSettings:
-    """The estimator `steered`."""
+    """The estimator `steered`, the default."""
 
     taper: float = setting(
         0.1,
@@ -256,12 +257,20 @@ class SteeredSettings:
         least=0,
         most=64,
     )
-    score: float = setting(
-        60.0,
-        "Least log-likelihood ratio of a source against noise alone; below it there is no bearing. Noise "
-        "alone gives 10 to 40, a loud caller hundreds.",
+    span_s: float = setting(
+        0.8,
+        "Time constant of the average that finds callers too faint for one frame. Longer hears further, and "
+        "lags on a drone that turns.",
+        unit="s",
+        least=0.1,
+        most=10,
+    )
+    smear: float = setting(
+        0.03,
+        "Share of the noise's matrix, averaged over 100 Hz to each side, that is added to it: more bears "
+        "rotors whose tones wander, less hears between tones that keep still.",
         least=0,
-        most=1e6,
+        most=1,
     )
     forget_s: float = setting(
         4.0,
@@ -277,13 +286,20 @@ class SteeredSettings:
 class DetectionSettings:
     """When a sound counts as a call."""
 
+    evidence: float = setting(
+        5.0,
+        "Estimator `steered`: how many times what noise alone scores a direction has to score to be a call. "
+        "5 gives less than one false call in an hour of rotors; 4 hears further.",
+        unit="times", least=1, most=1000,
+    )  # fmt: skip
     snr_db: float = setting(
-        0.0, "In-band level over the tracked background from which a frame is a call.",
+        0.0, "Other estimators: in-band level over the tracked background from which a frame is a call.",
         unit="dB", least=-20, most=60,
     )  # fmt: skip
     misfit: float = setting(
-        6.0, "Largest misfit of the delays with one far source.", unit="sigma", least=1, most=1000
-    )
+        6.0, "Other estimators: largest misfit of the delays with one far source.",
+        unit="sigma", least=1, most=1000,
+    )  # fmt: skip
     background_s: float = setting(
         6.0,
         "Time whose quietest moment is the background: a level that lasts longer, rotors or a call, is it.",

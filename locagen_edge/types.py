@@ -98,6 +98,16 @@ class Fix:
     """False: the delays do not bound the range, and only the direction means anything"""
 
 
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """That something calls at all."""
+
+    ratio: float
+    """of the best direction's score to that of noise alone"""
+    since_s: float
+    """for how long it has called, at the frame's end"""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Bearing:
     """Where the sound of one frame comes from. None instead of an angle: nothing can be said."""
@@ -113,6 +123,10 @@ class Bearing:
     where an estimator judges that otherwise"""
     estimator: str
     fix: Fix | None = None
+    evidence: Evidence | None = None
+    """None where an estimator does not know whether it is a call"""
+    span_s: float = 0.0
+    """time constant of the average over sound before the frame that it was taken from"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +138,8 @@ class Detection:
     """in-band, mean of the live microphones, over the tracked background"""
     level_dbfs: float
     """in-band level, mean of the live microphones"""
+    since_s: float = 0.0
+    """for how long it has called, at the frame's end; 0 where nothing calls"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from locagen_edge.settings import Settings, from_table
 from locagen_edge.types import Frame
 
 STEERED = from_table({"bearing": {"estimator": "steered"}})
+FAR_FIELD = from_table({"bearing": {"estimator": "far-field"}})
 
 
 def noise(settings: Settings, seconds: float, seed: int = 0) -> np.ndarray:
@@ -49,7 +50,7 @@ def test_a_threshold_changes_no_learnt_noise() -> None:
     other = changed(
         STEERED,
         detection={"snr_db": 3.0, "background_s": 5.0},
-        steered={"score": 80.0, "forget_s": 2.0},
+        steered={"span_s": 1.0, "forget_s": 2.0},
         track={"coast_s": 1.0, "most": 2},
         pose={"compass_deg": 5.0},
         mavlink={"rate_hz": 5.0},
@@ -62,17 +63,17 @@ def test_a_threshold_changes_no_learnt_noise() -> None:
 
 
 def test_a_limit_holds_from_the_next_frame_on() -> None:
-    frames = with_call(Settings())
-    pipeline = Pipeline(Settings())
+    frames = with_call(FAR_FIELD)
+    pipeline = Pipeline(FAR_FIELD)
     for frame in frames[:-4]:
         estimate = pipeline.process(frame)
     assert estimate.detection.call
     assert estimate.track is not None
     number = estimate.track.id
-    pipeline.apply(changed(Settings(), detection={"snr_db": 60.0}))
+    pipeline.apply(changed(FAR_FIELD, detection={"snr_db": 60.0}))
     deaf = pipeline.process(frames[-4])
     assert not deaf.detection.call
-    pipeline.apply(Settings())
+    pipeline.apply(FAR_FIELD)
     again = pipeline.process(frames[-3])
     assert again.detection.call
     assert again.detection.snr_db == pytest.approx(deaf.detection.snr_db, abs=1.0), "the background stayed"
@@ -104,31 +105,31 @@ def test_the_arrays_yaw_turns_the_bearing(estimator: str) -> None:
 
 
 def test_a_caller_keeps_its_number_when_the_array_is_turned() -> None:
-    frames = with_call(Settings())
-    pipeline = Pipeline(Settings())
+    frames = with_call(FAR_FIELD)
+    pipeline = Pipeline(FAR_FIELD)
     for frame in frames[:-1]:
         before = pipeline.process(frame)
     assert before.track is not None
-    pipeline.apply(changed(Settings(), array={"mount_deg": (0.0, 0.0, 1.0)}))
+    pipeline.apply(changed(FAR_FIELD, array={"mount_deg": (0.0, 0.0, 1.0)}))
     after = pipeline.process(frames[-1])
     assert after.track is not None
     assert after.track.id == before.track.id
 
 
 def test_sound_of_another_shape_is_refused_and_nothing_changes() -> None:
-    pipeline = Pipeline(Settings())
+    pipeline = Pipeline(FAR_FIELD)
     with pytest.raises(SettingsError, match="audio"):
-        pipeline.apply(changed(Settings(), audio={"hop": 256}, detection={"snr_db": 60.0}))
-    for frame in with_call(Settings()):
+        pipeline.apply(changed(FAR_FIELD, audio={"hop": 256}, detection={"snr_db": 60.0}))
+    for frame in with_call(FAR_FIELD):
         estimate = pipeline.process(frame)
     assert estimate.detection.call
 
 
 def test_what_cannot_be_made_changes_nothing() -> None:
-    pipeline = Pipeline(Settings())
+    pipeline = Pipeline(FAR_FIELD)
     with pytest.raises(ModelError):
-        pipeline.apply(changed(Settings(), bearing={"estimator": "model:none"}, detection={"snr_db": 60.0}))
-    for frame in with_call(Settings()):
+        pipeline.apply(changed(FAR_FIELD, bearing={"estimator": "model:none"}, detection={"snr_db": 60.0}))
+    for frame in with_call(FAR_FIELD):
         estimate = pipeline.process(frame)
     assert estimate.detection.call
     assert estimate.bearing.estimator == "far-field"
@@ -204,11 +205,11 @@ def test_a_parameter_is_applied_live_and_holds_after_a_restart(operator, tmp_pat
             await until(lambda: operator.of("HEARTBEAT") and daemon.estimate)
             if first:
                 operator.set("LG_TRK_COAST", 7.5)
-                operator.set("LG_DET_SNR", 60.0)
+                operator.set("LG_DET_EVIDENCE", 1000.0)
                 await until(lambda: len(operator.of("PARAM_VALUE")) == 2)
                 await until(lambda: daemon._applied.track.coast_s == 7.5 and daemon._applying is None)
             assert daemon.pipeline._track._settings.coast_s == 7.5
-            assert daemon.pipeline._detect._settings.snr_db == 60.0
+            assert daemon.pipeline._detect._settings.evidence == 1000.0
             estimates = daemon.counters.estimates
             await until(lambda: daemon.counters.estimates > estimates + 3)
             assert not daemon.estimate.detection.call

@@ -33,10 +33,11 @@ from locagen_edge.settings import Settings
 TABLE: Mapping[str, str] = {
     "LG_ARRAY_YAW": "array.mount_deg[2]",
     "LG_AIR_TEMP": "environment.temperature_c",
+    "LG_DET_EVIDENCE": "detection.evidence",
     "LG_DET_SNR": "detection.snr_db",
     "LG_DET_MISFIT": "detection.misfit",
     "LG_DET_BACKGR": "detection.background_s",
-    "LG_STEER_SCORE": "steered.score",
+    "LG_STEER_SPAN": "steered.span_s",
     "LG_STEER_FORGET": "steered.forget_s",
     "LG_TRK_COAST": "track.coast_s",
     "LG_TRK_AGIL_B": "track.agility_deg_s2",

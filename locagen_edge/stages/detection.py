@@ -1,4 +1,8 @@
-"""Frame's level and its bearing's misfit -> Detection: does something call?
+"""Bearing's evidence, or the frame's level and the bearing's misfit -> Detection: does something call?
+
+An estimator that judges the spectra themselves says how far its best direction stands out of what noise
+alone gives: from `detection.evidence` on it is a call, whatever the level. Those that only see delays need
+the level:
 
 The in-band level is held against the background: the lowest smoothed level of the last
 `detection.background_s` (minimum statistics: Martin, "Noise power spectral density estimation based on
@@ -41,20 +45,27 @@ class Detector:
         self._smooth: float | None = None
         self._minima: deque[float] = deque(maxlen=PIECES)
         self._piece_s = 0.0
+        self._since_s = 0.0
 
     def __call__(self, correlation: Correlation, bearing: Bearing, elapsed_s: float) -> Detection:
         """`elapsed_s`: since the previous frame."""
         power = correlation.power.astype(np.float64)
         live = power[power > SILENCE]
         if not len(live):
+            self._since_s = 0.0
             return Detection(call=False, snr_db=SNR_RANGE_DB[0], level_dbfs=10.0 * math.log10(SILENCE))
         level = float(live.mean())
         background = self._follow(level, elapsed_s)
         least, most = SNR_RANGE_DB
         excess = level / background - 1.0
         snr_db = min(max(10.0 * math.log10(excess), least), most) if excess > 0.0 else least
-        call = snr_db >= self._settings.snr_db and bearing.misfit <= self._settings.misfit
-        return Detection(call=call, snr_db=snr_db, level_dbfs=10.0 * math.log10(level))
+        if bearing.evidence is not None:
+            call, since_s = bearing.evidence.ratio >= self._settings.evidence, bearing.evidence.since_s
+        else:
+            call = snr_db >= self._settings.snr_db and bearing.misfit <= self._settings.misfit
+            since_s = self._since_s + elapsed_s
+        self._since_s = since_s if call else 0.0
+        return Detection(call, snr_db, 10.0 * math.log10(level), self._since_s)
 
     def apply(self, settings: DetectionSettings) -> None:
         """New limits from the next frame on; the background stays."""

@@ -1,4 +1,4 @@
-"""Frame, Correlation and Bearing -> what is wrong with the microphones, in words for the operator.
+"""Frame, Correlation and Tdoa -> what is wrong with the microphones, in words for the operator.
 
 Each symptom is one line of a table: a test that says, per frame, for which microphones it holds. A symptom
 becomes a fault once it has held for most of a second, and is forgotten as slowly.
@@ -14,7 +14,9 @@ import math
 
 import numpy as np
 
-from locagen_edge.types import Bearing, Correlation, Frame, Tdoa
+from locagen_edge.geometry import FLAT_M
+from locagen_edge.settings import Settings
+from locagen_edge.types import F64, Correlation, Frame, Tdoa
 
 MEMORY_S = 0.5
 RAISE, CLEAR = 0.7, 0.2
@@ -35,7 +37,30 @@ MISFIT = 10.0
 """Sigmas. One far source with strong peaks gives about 1; microphones of a square swapped, 17 to 110."""
 
 
-def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearing) -> set[str]:
+class DelayFit:
+    """How well delays fit any direction at all, as the array is believed to be."""
+
+    def __init__(self, settings: Settings):
+        baselines = settings.mic_array.baselines_m
+        _, thickness, axes = np.linalg.svd(baselines)
+        flat = len(thickness) < 3 or thickness[2] < FLAT_M
+        self._slope: F64 = baselines @ axes[: 2 if flat else 3].T / settings.speed_m_s
+        self._inverse: F64 = np.linalg.pinv(self._slope)
+        self._spare = len(baselines) - self._slope.shape[1]
+        self._tolerance_s = math.sqrt(2.0) * settings.array.tolerance_m / settings.speed_m_s
+
+    def misfit(self, tdoa: Tdoa) -> float:
+        """rms of (measured - fitted) delay over its sigma, by least squares for u with |u| at most 1; 0
+        where there are no more delays than unknowns, or one is missing."""
+        if self._spare < 1 or not np.isfinite(tdoa.delay_s).all():
+            return 0.0
+        u = self._inverse @ tdoa.delay_s
+        u /= max(1.0, float(np.linalg.norm(u)))
+        off = (tdoa.delay_s - self._slope @ u) / np.hypot(tdoa.sigma_s, self._tolerance_s)
+        return math.sqrt(float(off @ off) / self._spare)
+
+
+def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, misfit: float) -> set[str]:
     """What is wrong in this frame alone, in words; microphones counted from 0 as in the settings."""
     samples = frame.samples
     mics = range(len(samples))
@@ -63,12 +88,7 @@ def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearin
         for j in live[k + 1 :]:
             if np.abs(samples[i] - samples[j]).max() <= SAME * magnitude[i].max():
                 found.add(f"microphones {i} and {j}: the same signal twice, check audio.channel_map")
-    if (
-        not dead
-        and not broken
-        and np.sort(tdoa.peak)[len(tdoa.peak) // 2] > STRONG_PEAK
-        and bearing.misfit > MISFIT
-    ):
+    if not dead and not broken and np.sort(tdoa.peak)[len(tdoa.peak) // 2] > STRONG_PEAK and misfit > MISFIT:
         found.add("the delays fit no direction: channels swapped, or array.positions_m is wrong")
     return found
 
@@ -76,15 +96,20 @@ def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearin
 class FaultFinder:
     """Turns symptoms of single frames into lasting faults. One per stream."""
 
-    def __init__(self) -> None:
+    def __init__(self, settings: Settings) -> None:
+        self._fit = DelayFit(settings)
         self._share: dict[str, float] = {}
         self._raised: set[str] = set()
 
+    def apply(self, settings: Settings) -> None:
+        """Another array or speed of sound from the next frame on; faults that last go on."""
+        self._fit = DelayFit(settings)
+
     def __call__(
-        self, frame: Frame, correlation: Correlation, tdoa: Tdoa, bearing: Bearing, elapsed_s: float
+        self, frame: Frame, correlation: Correlation, tdoa: Tdoa, elapsed_s: float
     ) -> tuple[str, ...]:
         """`elapsed_s`: since the previous frame."""
-        now = symptoms(frame, correlation, tdoa, bearing)
+        now = symptoms(frame, correlation, tdoa, self._fit.misfit(tdoa))
         keep = math.exp(-elapsed_s / MEMORY_S)
         for text in now | self._share.keys():
             share = keep * self._share.get(text, 0.0) + (1.0 - keep) * (text in now)

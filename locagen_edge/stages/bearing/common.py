@@ -11,16 +11,19 @@ import numpy as np
 
 from locagen_edge.geometry import MicArray
 from locagen_edge.settings import Settings
-from locagen_edge.types import F64, Bearing, Frame, Tdoa
+from locagen_edge.types import F64, Bearing, Evidence, Frame, Tdoa
 
 Estimator = Callable[[Tdoa], Bearing]
 """From delays to a direction, frame by frame."""
 
 
 class Locator(Protocol):
-    """What the pipeline asks for a bearing, once a frame."""
+    """What the pipeline asks for bearings, once a frame."""
 
-    def __call__(self, frame: Frame, tdoa: Tdoa, /) -> Bearing: ...
+    def __call__(self, frame: Frame, tdoa: Tdoa, elapsed_s: float, /) -> tuple[Bearing, ...]:
+        """Of the sources in the frame, the strongest first; at least one, if only to say "no bearing".
+        `elapsed_s`: since the previous frame."""
+        ...
 
     def settle(self, call: bool, /) -> None:
         """Told afterwards whether the frame was taken for a call."""
@@ -38,8 +41,8 @@ class OnDelays:
     def __init__(self, estimate: Estimator):
         self._estimate = estimate
 
-    def __call__(self, _: Frame, tdoa: Tdoa, /) -> Bearing:
-        return self._estimate(tdoa)
+    def __call__(self, _: Frame, tdoa: Tdoa, __: float, /) -> tuple[Bearing, ...]:
+        return (self._estimate(tdoa),)
 
     def settle(self, _: bool, /) -> None:
         """Nothing is learnt."""
@@ -58,9 +61,9 @@ LARGEST_AZIMUTH_SIGMA_RAD = math.radians(60.0)
 """Beyond this the answer is "no bearing"."""
 
 
-def no_bearing(estimator: str) -> Bearing:
-    """The answer where the delays say nothing: silence, or too few live microphones."""
-    return Bearing(None, NOWHERE_RAD, None, NOWHERE_RAD, math.inf, estimator)
+def no_bearing(estimator: str, evidence: Evidence | None = None) -> Bearing:
+    """The answer where the sound says nothing: silence, noise alone, or too few live microphones."""
+    return Bearing(None, NOWHERE_RAD, None, NOWHERE_RAD, math.inf, estimator, evidence=evidence)
 
 
 @dataclass(frozen=True, eq=False)

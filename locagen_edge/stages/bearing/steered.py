@@ -4,26 +4,45 @@ Delays throw away what does not fit into one number a pair; the search over dire
 noise it comes close to the Cramer-Rao bound, and it hears under rotors, which are loud but always come from
 the same places: the noise's cross-spectral matrix is learnt while nothing calls, held while something does,
 and divided out. The mathematics and its sources: `csrc/locagen.h`.
+
+Two averages of the signal are searched side by side, one frame and about a second. A loud caller is placed by
+the frame, anew each time; one too faint for that by the second, with what that takes from a drone that turns.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 
-from locagen_edge.geometry import tolerance_rad
-from locagen_edge.kernel import Steered
+import numpy as np
+
+from locagen_edge.geometry import direction, tolerance_rad
+from locagen_edge.kernel import Source, Steered
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import LARGEST_AZIMUTH_SIGMA_RAD, NOWHERE_RAD, no_bearing
-from locagen_edge.types import Bearing, Frame, Tdoa
+from locagen_edge.stages.bearing.evidence import Onsets, Usual
+from locagen_edge.types import F32, Bearing, Evidence, Frame, Tdoa
 
 NAME = "steered"
 
 DEAD = 1e-5
 """Of the loudest microphone's power: what the kernel takes for a dead one."""
 
-LOOKS = 7
-"""Frames of noise per microphone before the first bearing (1.1 s for three at the default hop): a matrix
+LOOKS = 5
+"""Frames of noise per microphone before the first bearing (0.8 s for three at the default hop): a matrix
 learnt from fewer is nearly singular, and whitening by it invents sources."""
+
+LAG_S = 0.5
+"""Noise is learnt so late: by then a call is known as one, and its beginning is not learnt."""
+MEANING = 1.6
+"""Evidence from which a direction means something, though not yet a call."""
+UNUSUAL = 9.0
+"""Times the usual spread: more is not believed of what may be a call."""
+WATCH_S = 15.0
+LOUDER = -0.5
+"""Contrast over score below which all of the noise has become louder: about -2 where it has, 0 for a call."""
+SECOND = 0.1
+"""Least score of a second caller beside the first one's: below it lies what a null leaves of the first."""
 
 
 class SteeredLocator:
@@ -31,6 +50,9 @@ class SteeredLocator:
 
     def __init__(self, settings: Settings):
         steered, audio = settings.steered, settings.audio
+        self._hop_s = hop_s = settings.hop_s
+        self._lag = min(64, math.ceil(LAG_S / hop_s))
+        self._spans_s = (0.0, steered.span_s)
         self._search = Steered(
             settings.mic_array.positions_m,
             frame=audio.frame,
@@ -40,36 +62,99 @@ class SteeredLocator:
             band_hz=(settings.correlation.band_hz[0], settings.correlation.band_hz[1]),
             taper=steered.taper,
             smooth_bins=steered.smooth_bins,
+            spans=len(self._spans_s),
+            lag=self._lag,
+            smear=steered.smear,
             floor=10 ** (settings.correlation.floor_dbfs / 10),
         )
+        rows, columns = np.meshgrid(self._search.elevation_rad, self._search.azimuth_rad, indexing="ij")
+        self._grid_u = np.stack(
+            [direction(float(a), float(e)) for a, e in zip(columns.ravel(), rows.ravel(), strict=True)]
+        )
+        self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
+        self._looks = LOOKS * settings.mic_array.mics
+        self._elapsed_s = 0.0
         # A microphone that fails for a moment must not be missing from the matrix for long after; one that
         # has failed for good must not keep the others from learning.
         self._bad_hops = 0
-        self._looks = LOOKS * settings.mic_array.mics
-        self._to_learn = self._looks
-        self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
         self.apply(settings)
+        self._know_nothing()
+
+    def _know_nothing(self) -> None:
+        self._to_learn = self._looks
+        self._usual = tuple(Usual() for _ in self._spans_s)
+        self._onsets = Onsets(self._hop_s)
+        self._scores = [0.0 for _ in self._spans_s]
+        self._failing: deque[bool] = deque(maxlen=self._lag + 1)
+        self._quiet_hops = 0
+        self._since_lag: deque[float] = deque([0.0], maxlen=self._lag + 1)
 
     def apply(self, settings: Settings, /) -> None:
-        """Score and memory as these settings say; the noise's matrix stays."""
-        self._least_score = settings.steered.score
-        self._share = 1.0 - math.exp(-settings.hop_s / settings.steered.forget_s)
-        self._patience = settings.steered.forget_s / settings.hop_s
+        """Limit and memories as these settings say; what was learnt of the noise stays."""
+        self._least_ratio = settings.detection.evidence
+        self._spans_s = (0.0, settings.steered.span_s)
+        self._forget_s = settings.steered.forget_s
+        self._patience = settings.steered.forget_s / self._hop_s
 
     def forget(self) -> None:
         """Begins anew with the noise's matrix."""
         self._search.reset()
-        self._to_learn = self._looks
+        self._know_nothing()
 
-    def __call__(self, frame: Frame, _: Tdoa, /) -> Bearing:
+    def __call__(self, frame: Frame, _: Tdoa, elapsed_s: float, /) -> tuple[Bearing, ...]:
         power, bad_mics = self._search.listen(frame.samples)
         failing = bad_mics != 0 or power.min() < DEAD * power.max()
         self._bad_hops = self._bad_hops + 1 if failing else 0
-        self._search.hear(1.0)
-        found = self._search.search(1)
-        if not found or self._to_learn > 0 or found[0].score < self._least_score:
-            return no_bearing(NAME)
-        source = found[0]
+        self._failing.append(bool(failing))
+        self._elapsed_s = elapsed_s
+        if elapsed_s > LAG_S:
+            self._onsets.forget()
+        found = [self._heard(span, elapsed_s) for span in range(len(self._spans_s))]
+        if self._to_learn > 0:
+            return (no_bearing(NAME),)
+        return self._best(found) or (no_bearing(NAME, Evidence(min(max(self._ratios()), MEANING), 0.0)),)
+
+    def _best(self, found: list[list[Source]]) -> tuple[Bearing, ...]:
+        """Of the spans: the frame where that is a call by itself, else whichever stands out more."""
+        ratios = self._ratios()
+        order = sorted(range(len(found)), key=lambda span: -ratios[span])
+        if ratios[0] >= self._least_ratio:
+            order = [0, *order]
+        for span in order:
+            if not found[span]:
+                continue
+            towards = self._nearest(found[span][0])
+            # an average over a second remembers what has ended
+            if span == 0 or self._onsets.going_on(towards):
+                evidence = Evidence(ratios[span], self._onsets.since_s(towards))
+                return tuple(self._told(source, span, evidence) for source in found[span])
+        return ()
+
+    def _ratios(self) -> list[float]:
+        """How the best score of each span stands out."""
+        return [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
+
+    def _heard(self, span: int, elapsed_s: float) -> list[Source]:
+        """The callers in one span; none where the noise alone is as good a reason."""
+        span_s = self._spans_s[span]
+        self._search.hear(1.0 - math.exp(-elapsed_s / span_s) if span_s > 0.0 else 1.0, span)
+        sources = self._search.search(2, span, MEANING * self._usual[span].level)
+        scores: F32 = self._search.map(span)
+        if span == 0:
+            self._onsets.hear(scores)
+        self._scores[span] = max(float(scores.max()), sources[0].score if sources else 0.0)
+        if not sources:
+            return []
+        if sources[0].contrast < LOUDER * sources[0].score:
+            self._scores[span] = 0.0
+            return []
+        return [s for s in sources if s.score > SECOND * sources[0].score]
+
+    def _nearest(self, source: Source) -> int:
+        """On the grid."""
+        return int(np.argmax(self._grid_u @ direction(source.azimuth_rad, source.elevation_rad)))
+
+    def _told(self, source: Source, span: int, evidence: Evidence) -> Bearing:
         azimuth_sigma, elevation_sigma = source.sigma_rad()
         # positions that are off turn a source below by as much over cos(elevation)
         tolerance = self._tolerance / max(math.cos(source.elevation_rad), 0.1)
@@ -82,13 +167,37 @@ class SteeredLocator:
             elevation_sigma_rad=min(elevation_sigma, NOWHERE_RAD),
             misfit=0.0,  # the score has judged already whether a source explains the frame
             estimator=NAME,
+            evidence=evidence,
+            span_s=self._spans_s[span],
         )
 
     def settle(self, call: bool, /) -> None:
-        """Whether the frame was taken for a call: if not, it is noise to learn from.
-
-        So a caller too faint to be detected is learnt too, and fades within `steered.forget_s`.
+        """Whether the frame was taken for a call: if not, it is noise to learn from, once `LAG_S` has shown
+        that no call began in it; so a caller too faint to be detected is learnt too, and fades within
+        `steered.forget_s`. Of what may be a call little is learnt, the less the surer it is: noise that was
+        taken for one does not stay unknown.
         """
-        if not call and (self._bad_hops == 0 or self._bad_hops > self._patience):
-            self._search.learn(self._share)
+        if self._to_learn <= 0:
+            self._watch(call)
+        if len(self._failing) > self._lag and (not self._failing[0] or self._bad_hops > self._patience):
+            surest = max(self._since_lag) if self._to_learn <= 0 else 0.0
+            caution = min(1.0, (self._least_ratio / max(surest, 1e-9)) ** 2)
+            self._search.learn(caution * (1.0 - math.exp(-self._elapsed_s / self._forget_s)))
             self._to_learn = max(self._to_learn - 1, 0)
+
+    def _watch(self, call: bool) -> None:
+        """What the noise's scores are, put aside until it is sure that they are the noise's."""
+        share = 1.0 - math.exp(-self._hop_s / WATCH_S)
+        self._since_lag.append(max(self._ratios()))
+        self._quiet_hops = 0 if call else self._quiet_hops + 1
+        for span in range(len(self._spans_s)):
+            if call:
+                self._search.doubt(share, UNUSUAL, span)
+                continue
+            self._search.watch(span)
+            if self._quiet_hops % self._lag == 0:
+                self._search.settle(share, span)
+        for usual, score in zip(self._usual, self._scores, strict=True):
+            usual.learn(score, self._elapsed_s)
+        if not self._usual[0].young and max(self._since_lag) < self._least_ratio:
+            self._onsets.learn(self._lag, self._elapsed_s)

@@ -116,7 +116,7 @@ class Tracker:
         heard = [b for b in bearings if _usable(b)] if detection.call else []
         if heard:
             rate = turned_rad / elapsed_s if elapsed_s > 0.0 else 0.0
-            self._hear(heard, (rate * SWELL_S) ** 2, elapsed_s)
+            self._hear(heard, rate, elapsed_s)
         self._order()
         return tuple(self._told(caller) for caller in self._callers)
 
@@ -154,10 +154,17 @@ class Tracker:
 
     # --- what is heard
 
-    def _hear(self, bearings: list[Bearing], moved: float, dt: float) -> None:
+    def _hear(self, bearings: list[Bearing], rate: float, dt: float) -> None:
         turn = np.eye(3) if self._turn is None else self._turn
         measurements = [
-            sphere.measured(b, turn, fixed=self._fixed, inflation=self._inflation, moved=moved)
+            sphere.measured(
+                b,
+                turn,
+                fixed=self._fixed,
+                # of an average over time, each hop brings dt / (2 span) that is new
+                inflation=max(self._inflation, 2.0 * b.span_s / max(dt, 1e-3)),
+                moved=(rate * max(SWELL_S, b.span_s)) ** 2,
+            )
             for b in bearings
         ]
         innovations = [[self._nearest(c.state, m) for c in self._callers] for m in measurements]

@@ -1,0 +1,105 @@
+"""How sure it is that something calls, at a constant false-alarm rate, and since when.
+
+The kernel's score of a direction is a likelihood ratio against the learnt noise, with the looks of each
+direction and part of the band lessened by how they have strayed before (`csrc/locagen.h`). What is left of
+the noise's temper is divided out here: the ratio is the best score over its own average while nothing called
+("cell averaging", in time: Finn & Johnson, "Adaptive detection mode with threshold control as a function of
+spatially sampled clutter-level estimates", RCA Review 29 (1968)).
+
+The onset is the change point of greatest likelihood in the frames' own scores towards the caller (Page,
+"Continuous inspection schemes", Biometrika 41 (1954)).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from locagen_edge.types import F32
+
+SCORE = 20.0
+"""Added to the average: the least that noise gives, however still it keeps."""
+YOUNG, YOUNG_S = 600.0, 1.2
+"""Added while the noise has just been learnt and is hardly known: falls by e in each of these times."""
+MEMORY_S = 20.0
+LOUDEST = 2.0
+"""The average takes no more than so many times itself at once: a call that was not recognised."""
+CLIP = 60.0
+"""A frame's score counts up to here, so that one clap does not outweigh a second of voice."""
+DRIFT = 3.0
+"""By how much a frame of a call is above what is usual, at least."""
+RECENT_S = 0.3
+HISTORY_S = 2.0
+RISE_S = 0.08
+"""From a call's begin to the end of the first frame that it fills enough to be seen in, on average."""
+
+
+class Usual:
+    """What the best score of noise alone is, on average."""
+
+    def __init__(self) -> None:
+        self._sum = self._weight = 0.0
+        self._youth = YOUNG
+
+    def ratio(self, score: float) -> float:
+        return score / self.level
+
+    @property
+    def young(self) -> bool:
+        """Whether the noise is hardly known yet."""
+        return self._youth > SCORE / 10.0
+
+    @property
+    def level(self) -> float:
+        """The score whose ratio is 1."""
+        return SCORE + self._youth + (self._sum / self._weight if self._weight else 0.0)
+
+    def learn(self, score: float, elapsed_s: float) -> None:
+        self._youth *= math.exp(-elapsed_s / YOUNG_S)
+        if self.young:
+            return
+        share = 1.0 - math.exp(-elapsed_s / MEMORY_S)
+        self._sum += share * (min(score, LOUDEST * self.level) - self._sum)
+        self._weight += share * (1.0 - self._weight)
+
+
+class Onsets:
+    """The frames' scores of the last seconds, direction by direction."""
+
+    def __init__(self, hop_s: float):
+        self._hop_s = hop_s
+        self._recent = max(1, round(RECENT_S / hop_s))
+        self._history: deque[F32] = deque(maxlen=max(2, round(HISTORY_S / hop_s)))
+        self._usual: F32 | None = None
+
+    def hear(self, scores: F32) -> None:
+        """(directions...) of one frame."""
+        self._history.append(np.minimum(scores.ravel(), np.float32(CLIP)))
+
+    def learn(self, lag: int, elapsed_s: float) -> None:
+        """The frame `lag` before the last held no call."""
+        if len(self._history) <= lag:
+            return
+        share = np.float32(1.0 - math.exp(-elapsed_s / MEMORY_S))
+        then = self._history[-1 - lag]
+        self._usual = then.copy() if self._usual is None else self._usual + share * (then - self._usual)
+
+    def _towards(self, direction: int) -> np.ndarray:
+        """How far each frame's score is above what is usual there, the oldest first."""
+        usual = 0.0 if self._usual is None else float(self._usual[direction])
+        return np.array([scores[direction] for scores in self._history]) - usual
+
+    def going_on(self, direction: int) -> bool:
+        """Whether it still calls from there: an average over a second remembers what has ended."""
+        return float(self._towards(direction)[-self._recent :].mean()) > DRIFT
+
+    def since_s(self, direction: int) -> float:
+        """For how long it has called from there, at the last frame's end; `HISTORY_S` at most."""
+        from_the_end = np.cumsum(self._towards(direction)[::-1] - DRIFT)
+        return int(from_the_end.argmax()) * self._hop_s + RISE_S
+
+    def forget(self) -> None:
+        """Time has gone by unheard."""
+        self._history.clear()
