@@ -278,8 +278,9 @@ class Daemon:
         while (wanted := self.settings) is not self._applied:
             try:
                 await loop.run_in_executor(self._executor, self.pipeline.apply, wanted)
-            except LocagenError as error:
-                log.error("parameters are not applied: %s", error)
+            except Exception as error:  # whatever it is, the old settings go on listening
+                expected = isinstance(error, LocagenError)
+                log.error("parameters are not applied: %s", error, exc_info=not expected)
                 self.settings = self._applied
                 self.component.put_back(self._applied, f"Not applied: {error}")
             else:

@@ -343,7 +343,7 @@ class Component:
         """A message of ours that may be asked for once."""
         if message_id == dialect.AUTOPILOT_VERSION:
             return version_message(self._hands.uid)
-        return self._last.get(message_id)
+        return self._last.get(message_id) if message_id in self._allowed else None
 
     def interval_s(self, message_id: int, /) -> float | None:
         """How often a message of ours is sent; infinite: it is switched off; None: none of ours."""

@@ -10,12 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
 from test_component import CALLING, QUIET, decode, said, texts
-from test_parameters import answers, packed
+from test_parameters import answers, packed, setting
 
 from locagen_edge import __version__
+from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.commands import ACCEPTED, DENIED, RESEND_S, TABLE, UNSUPPORTED
 from locagen_edge.mavlink.component import Component, Hands
 from locagen_edge.mavlink.computer import Computer
+from locagen_edge.mavlink.framer import Framer
 from locagen_edge.mavlink.identity import machine_uid, version_number
 from locagen_edge.settings import MavlinkSettings
 
@@ -61,6 +63,27 @@ def test_every_command_to_us_is_acknowledged_to_its_sender_once(
 @given(st.sampled_from(sorted(TABLE)), st.tuples(*[st.floats(width=32) | st.integers(-1, 60000)] * 4))
 def test_no_parameter_of_a_known_command_raises(number: int, given: tuple[float, ...]) -> None:
     assert len(results(ask(Component(MavlinkSettings()), command(number, *given)))) == 1
+
+
+ASKED = sorted(
+    {dialect.PING, dialect.TIMESYNC, dialect.PARAM_SET, dialect.PARAM_REQUEST_READ, 21, 75, 76, 110}
+)
+
+
+@given(st.lists(st.tuples(st.sampled_from(ASKED), st.binary(max_size=255), st.booleans()), max_size=8))
+def test_nothing_that_is_asked_raises(asked: list[tuple[int, bytes, bool]]) -> None:
+    component = Component(MavlinkSettings(), hands=hands()[0])
+    for k, (id, content, ours) in enumerate(asked):
+        head = b"\xfd" + bytes((len(content), 0, 0, k, 255, 190)) + id.to_bytes(3, "little")
+        crc = dialect.checksum(head[1:] + content, dialect.LAYOUTS[id].crc_extra).to_bytes(2, "little")
+        message = dialect.decode(head + content + crc)
+        if ours and "target_system" in message.fieldnames:
+            message.target_system, message.target_component = 1, 191
+        frame = dialect.messages.MAVLink(None, 255, 190)
+        component.receive(bytes(message.pack(frame)), 0.1 * k)
+        component.due(0.1 * k, CALLING)
+        component.answers(0)
+    assert component.system_id == 1
 
 
 @pytest.mark.parametrize(("system", "target"), [(1, 1), (2, 191), (0, 191), (0, 0), (1, 192)])
@@ -131,6 +154,20 @@ def test_intervals_of_our_own_messages() -> None:
     assert ask(component, command(REQUEST, 244, 0))[1].interval_us == 1_000_000  # of HEARTBEAT
     assert ask(component, command(REQUEST, 244, 33))[1].interval_us == 0, "none of ours"
     assert ask(component, command(REQUEST, 244, 390))[1].interval_us == -1, "switched off"
+
+
+def test_the_last_record_comes_again_on_request_while_its_switch_is_on() -> None:
+    component = Component(MavlinkSettings(send_tunnel=False))
+    assert results(ask(component, command(REQUEST, 59500))) == [DENIED], "none so far"
+    said(component, CALLING, 1)
+    component.receive(packed(command(REQUEST, 59500)), 2.0)
+    frames = b"".join(component.answers(0))
+    ack, record = (dialect.decode(packet.raw) for packet in Framer().feed(frames))
+    assert ack.result == ACCEPTED
+    assert record.get_msgId() == 59500
+    component.receive(setting("LG_TX_RECORDS", 0.0), 3.0)
+    answers(component)
+    assert results(ask(component, command(REQUEST, 59500), 4.0)) == [DENIED]
 
 
 def test_who_we_are() -> None:

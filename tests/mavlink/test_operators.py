@@ -8,28 +8,42 @@ import os
 import shutil
 import socket
 import sys
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from itertools import count
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import ROOT
 from peers import WITHIN_S, free_port, operator
-from test_daemon import running, source, until, with_link
+from test_daemon import running, steady, until
 
 from locagen_edge.daemon import Daemon
 from locagen_edge.mavlink.parameters import NAMES, value_of
 from locagen_edge.settings import Settings, from_table
+from locagen_edge.types import Frame
 
 _PATH = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
 MAVPROXY = shutil.which("mavproxy.py", path=_PATH)
 
 
+async def calls(settings: Settings) -> AsyncIterator[Frame]:
+    """A second of a call, two of quiet, and so on, a little faster than real time."""
+    loud = steady(settings)
+    quiet = 1e-4 * np.random.default_rng(0).standard_normal((3, 1024)).astype(np.float32)
+    for number in count():
+        samples = quiet if number % 60 < 40 else loud[number % len(loud)].samples
+        yield Frame(samples, 10_000.0, time.monotonic_ns() - 102_400_000, number * 512)
+        await asyncio.sleep(0.03)
+
+
 @asynccontextmanager
 async def daemon_at(port: int, state: Path) -> AsyncIterator[Daemon]:
-    link = with_link(port).mavlink.link
-    settings = from_table({"mavlink": {"link": link, "signing_state": str(state)}})
-    async with running(settings, sources=source(settings, pace_s=0.02)) as daemon:
+    mavlink = {"link": f"udpout:127.0.0.1:{port}", "signing_state": str(state)}
+    settings = from_table({"mavlink": mavlink, "bearing": {"estimator": "far-field"}})
+    async with running(settings, sources=calls) as daemon:
         yield daemon
 
 
@@ -122,9 +136,14 @@ def test_mavproxy_lists_sets_and_commands_and_loads_our_module(tmp_path: Path) -
             assert not daemon.component.listening
             console.say("long 400 1")
             await console.until(lambda text: "COMPONENT_ARM_DISARM: UNSUPPORTED" in text)
+            await until(lambda: daemon.estimate is None)
             console.say("module load locagen_edge.mavproxy_locagen")
             await console.until(lambda text: "Loaded module locagen_edge.mavproxy_locagen" in text)
             console.say("locagen")
             await console.until(lambda text: "no call so far" in text)
+            console.say("long 31010 1")
+            await console.until(lambda text: "locagen: call 1 of vehicle 1" in text)
+            console.say("locagen")
+            await console.until(lambda text: "vehicle 1 call 1" in text)
 
     asyncio.run(test())

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
-from test_component import QUIET, heartbeat, said
+from test_component import CALLING, QUIET, heartbeat, said
 from test_parameters import answers, packed
 
+from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.component import Component
 from locagen_edge.mavlink.timesync import SyncedClock
 from locagen_edge.settings import MavlinkSettings
@@ -100,6 +102,23 @@ def test_answers_on_another_clock_than_the_messages_are_not_used() -> None:
     now_ns = synced(Autopilot(1, 1_700_000_000 * 10**9, jitter_ns=0.0), clock, 5)  # the time of day
     assert not clock.synced
     assert clock.boot_ms(now_ns) == pytest.approx(now_ns * 1e-6, abs=1.0)
+
+
+def test_records_carry_the_autopilots_time_and_say_so() -> None:
+    component = Component(MavlinkSettings(), start_s=2.0)
+    heard = replace(CALLING, t_ns=12_500_000_000)
+
+    def record(start_s: float) -> Any:
+        tunnels = [m for m in said(component, heard, 1, start_s) if m.get_type() == "TUNNEL"]
+        return dialect.untunnel(tunnels[0])
+
+    flag = dialect.messages.LOCAGEN_BEARING_FLAGS_AUTOPILOT_TIME
+    ours = record(20.0)
+    assert (ours.time_usec, ours.flags & flag) == (10_500_000, 0)
+    synced(Autopilot(1, 10**12, jitter_ns=0.0), component.clock, 3, 21)
+    theirs = record(25.0)
+    assert theirs.flags & flag
+    assert theirs.time_usec == 1_000_000_000 + 12_500_000
 
 
 def test_requests_are_answered_on_the_link_and_answers_are_not() -> None:
