@@ -154,7 +154,8 @@ int locagen_steer_reset(locagen_steer *state);
  * locagen_gcc_process. Returns 0, or a positive mask with bit m set where microphone m held a sample that is
  * not finite, or a power of 1e8 and more: its power is 0. Such a microphone, and one that is 50 dB and more
  * under the loudest (dead: no two microphones of one array differ so much), is left out of learn and hear;
- * one that was left out of more than a tenth of R_n or R_x is left out of the search. */
+ * one that was left out of more than a tenth of R_n or R_x is left out of the search; where those that are left
+ * stand in a line, and all of them do not, there is none. */
 int locagen_steer_listen(locagen_steer *state, const float *in, float *power);
 
 /* R_n <- (1 - share) R_n + share x x^H with the bins of the frame `lag` before the last, while nothing calls;
@@ -185,9 +186,9 @@ int locagen_steer_watch(locagen_steer *state, int32_t span);
 int locagen_steer_settle(locagen_steer *state, int32_t span, float share);
 
 /* Instead of watch, while something may call: drops what was put aside, and of the last search keeps in mind
- * as much as is at most `most` times what is usual there: little of a call, but noise that is taken for calls
+ * what lets nothing grow by more than the share `growth`: little of a call, but noise that is taken for calls
  * again and again ceases to be. */
-int locagen_steer_doubt(locagen_steer *state, int32_t span, float share, float most);
+int locagen_steer_doubt(locagen_steer *state, int32_t span, float share, float growth);
 
 /* Weights 0 to 1 of all bins, for the searches to come: each bin counts as so many looks less. */
 int locagen_steer_weigh(locagen_steer *state, const float *weight);

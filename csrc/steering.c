@@ -31,6 +31,8 @@ static const float CLOSE = 0.9f; /* the grid costs a lobe less than a tenth of i
 
 static const double SMEAR_HZ = 100;      /* each side: what a rotor's tones wander in some seconds at 4 kHz */
 static const double PRIOR_LOOKS = 4;     /* worth of theory against what q has been: independent values of it */
+static const double LEAST_UNBIASED = 0.25;
+static const float MOST_OVER = 10; /* q - 1 that is watched: a bang is forgotten within the usual time */
 static const double LOST = 0.1;          /* a microphone missing from more of R does not count */
 static const double SILENT = 1e-5;       /* power under the loudest one's: -50 dB */
 static const float LEAST_DENOMINATOR = 1e-6f; /* of microphones: loading keeps the true ones above it */
@@ -185,6 +187,7 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
 
     double per_metre = 2 * PI * c->rate_hz / c->frame / c->speed_m_s, arm[MOST_MICS][3], longest = 0;
     int at;
+    s->per_metre = per_metre;
     arms(c, arm, &at);
     for (int m = 0; m < c->mics; m++)
         for (int n = 0; n < 3; n++)
@@ -442,16 +445,41 @@ int locagen_steer_weigh(locagen_steer *memory, const float *weight)
     return LOCAGEN_OK;
 }
 
-/* Microphones that are in both R_n and R_x, as a mask; 0 where nothing can be looked for. */
+/* Whether these microphones stand in a line, to a millimetre: then a bearing has a mirror image. */
+static int in_a_line(const steer *s, int mics)
+{
+    int first = __builtin_ctz((unsigned)mics), far = first;
+    double most = 0, off = 0, along[3] = {0};
+    for (int m = 0; m < s->mics; m++) {
+        double d[3];
+        for (int n = 0; n < 3; n++)
+            d[n] = s->offset[m][n] - s->offset[first][n];
+        if ((mics >> m & 1) && dot(d, d) > most)
+            most = dot(d, d), far = m, memcpy(along, d, sizeof d);
+    }
+    for (int m = 0; m < s->mics && most > 0; m++) {
+        double d[3], across[3];
+        for (int n = 0; n < 3; n++)
+            d[n] = s->offset[m][n] - s->offset[first][n];
+        cross(d, along, across);
+        if (m != far && (mics >> m & 1))
+            off = fmax(off, dot(across, across) / most);
+    }
+    return off < 1e-6 * s->per_metre * s->per_metre;
+}
+
+/* Microphones that are in both R_n and R_x, as a mask; 0 where nothing can be looked for, or an array that
+ * has a plane would have lost it. */
 static int usable_mics(const steer *s, const locagen_span *x)
 {
-    int mask = 0, count = 0;
+    int mask = 0, count = 0, all = (1 << s->mics) - 1;
     for (int m = 0; m < s->mics; m++) {
         int lost = (double)x->lost[m] > LOST * x->heard || (double)s->lost_noise[m] > LOST * s->learnt;
         mask |= !lost << m;
         count += !lost;
     }
-    return x->heard > 0 && count >= 2 ? mask : 0;
+    int lost_plane = count >= 2 && mask != all && in_a_line(s, mask) && !in_a_line(s, all);
+    return x->heard > 0 && count >= 2 && !lost_plane ? mask : 0;
 }
 
 static double looks_of(const steer *s, double weight, double variance)
@@ -492,9 +520,17 @@ static locagen_spread spread_of(const steer *s, locagen_span *x)
         return spread;
     double prior = prior_of(s, x), total = x->watched + prior;
     spread.spread = x->spread;
-    spread.rate = (float)(looks(s, x) * averaged(s) / total);
+    spread.rate = (float)(1 / total);
     spread.offset = (float)(prior / total);
     return spread;
+}
+
+/* From (q - 1)^2 to what theory expects of it. Only deviations above 1 are counted; of an average of k looks,
+ * gamma distributed, their mean square is (1 + 0.52 / sqrt(k)) / (2 k) (by simulation, k from 4 to 200). */
+static float over_theory(const steer *s, const locagen_span *x)
+{
+    double k = looks(s, x) * averaged(s);
+    return (float)(2 * k / (1 + 0.52 / sqrt(k)));
 }
 
 /* Numbers in `over` and all that is made of it. */
@@ -511,7 +547,9 @@ int locagen_steer_watch(locagen_steer *memory, int32_t span)
     locagen_span *x = span_of(s, span);
     if (x == NULL)
         return LOCAGEN_E_SPAN;
-    s->paths->add_squares(spread_count(s), x->over, x->aside[0]);
+    if (x->heard <= 0 || s->learnt <= 0)
+        return LOCAGEN_OK;
+    s->paths->add_squares(spread_count(s), over_theory(s, x), MOST_OVER, x->over, x->aside[0]);
     x->aside_count[0]++;
     return LOCAGEN_OK;
 }
@@ -538,7 +576,7 @@ int locagen_steer_settle(locagen_steer *memory, int32_t span, float share)
     return LOCAGEN_OK;
 }
 
-int locagen_steer_doubt(locagen_steer *memory, int32_t span, float share, float most)
+int locagen_steer_doubt(locagen_steer *memory, int32_t span, float share, float growth)
 {
     if (memory == NULL)
         return LOCAGEN_E_NULL;
@@ -546,18 +584,19 @@ int locagen_steer_doubt(locagen_steer *memory, int32_t span, float share, float 
     locagen_span *x = span_of(s, span);
     if (x == NULL)
         return LOCAGEN_E_SPAN;
-    if (!within((double)share, 0, 1) || !within((double)most, 0, 1e6))
+    if (!within((double)share, 0, 1) || !within((double)growth, 0, 1))
         return LOCAGEN_E_SHARE;
     for (int i = 0; i < 2; i++)
         if (x->aside_count[i] > 0) {
             memset(x->aside[i], 0, (size_t)spread_count(s) * sizeof *x->aside[i]);
             x->aside_count[i] = 0;
         }
-    if (x->heard <= 0 || s->learnt <= 0)
+    if (x->heard <= 0 || s->learnt <= 0 || share == 0)
         return LOCAGEN_OK;
-    double usual = x->watched + prior_of(s, x), theory = prior_of(s, x) / (looks(s, x) * averaged(s));
-    s->paths->blend_squares(spread_count(s), share, (float)((double)most / usual),
-                            (float)((double)most * theory / usual), x->over, x->spread);
+    double prior = prior_of(s, x), total = x->watched + prior;
+    double most = 1 + (double)growth * (total + (double)share) / (double)share;
+    s->paths->blend_squares(spread_count(s), share, over_theory(s, x), (float)(most / total),
+                            (float)(most * prior / total), x->over, x->spread);
     x->watched = (double)(1.0f - share) * x->watched + (double)share;
     return LOCAGEN_OK;
 }
@@ -756,6 +795,15 @@ static int find_best(const steer *s, enum locagen_measure measure, const locagen
     return lobes > 0 && best->score > (double)least;
 }
 
+/* 1 / E q of noise, whitened by a matrix from N looks at it: of such an adaptive beam the output power over
+ * 1 / (a^H R_n^-1 a) (Reed, Mallett & Brennan 1974, "Rapid convergence rate in adaptive arrays", with the complex
+ * Wishart distribution). Loading takes over where looks are few. */
+static double unbiased(const steer *s, int mics)
+{
+    double n = looks_of(s, s->learnt, s->learnt_variance);
+    return fmax(LEAST_UNBIASED, (n - mics + 1) * (n - mics) / (n * n));
+}
+
 /* How R_n is to be had; where it was never learnt, its level from the power across the direction of most
  * power. Leaves its inverse for whitening. */
 static locagen_whitening whitening(steer *s, const locagen_span *x)
@@ -765,6 +813,7 @@ static locagen_whitening whitening(steer *s, const locagen_span *x)
     s->fine.least = s->coarse.least = LEAST_DENOMINATOR * count;
     if (s->learnt > 0) {
         how.noise_scale = (float)(1 / s->learnt);
+        how.signal_scale *= (float)unbiased(s, __builtin_popcount((unsigned)how.mics));
         if (s->inverse_mics != how.mics)
             s->paths->invert(s, &how);
         s->inverse_mics = how.mics;

@@ -36,7 +36,7 @@ typedef struct {
     float *signal;              /* R_x times the sum of its weights */
     float *scores;              /* of the grid, in the last search */
     float *over, *spread;       /* [vector of directions][coarse bin][lane]: q - 1 where above 0, in the last
-                                 * search; twice its mean square times the sum of the weights */
+                                 * search; its mean square over theory's, times the sum of the weights */
     float *aside[2];            /* sums of such squares, since settle and before */
     int32_t aside_count[2];
 } locagen_span;
@@ -51,6 +51,7 @@ typedef struct steer {
     float loading, floor;
     double axes[3][3];          /* in the array's plane: first and second axis, and its normal, downwards */
     double offset[MOST_MICS][3];/* p_m - p_0, as radians of phase per bin of frequency and unit of u */
+    double per_metre;           /* radians of phase per bin of frequency and metre */
     double reach;               /* radians of phase at the band's upper end across the array */
     double looks;               /* independent looks in one frame: under 1 for a tapered window */
     double overlap[8];          /* squared coherence of the windows of frames 1 .. hops apart */
@@ -104,9 +105,9 @@ typedef struct locagen_steer_paths {
     int32_t width;              /* lanes */
     int (*listen)(steer *s, const float *in, float *power);
     void (*add)(const steer *s, int32_t slot, float keep, float share, float *matrix);
-    void (*add_squares)(long count, const float *over, float *sum);
+    void (*add_squares)(long count, float scale, float most, const float *over, float *sum);
     void (*blend)(long count, float keep, float share, const float *from, float *to);
-    void (*blend_squares)(long count, float share, float rate, float offset, const float *over,
+    void (*blend_squares)(long count, float share, float scale, float rate, float offset, const float *over,
                           float *spread);
     void (*invert)(const steer *s, const locagen_whitening *how);
     void (*whiten)(const steer *s, const locagen_whitening *how);

@@ -121,21 +121,21 @@ STEP void blend(long count, float keep, float share, const float *from, float *t
         store(to + n, keep * load(to + n) + share * load(from + n));
 }
 
-/* Half of the deviations from 1, those above it, stand for all. */
-STEP void add_squares(long count, const float *over, float *sum)
+STEP void add_squares(long count, float scale, float most, const float *over, float *sum)
 {
     for (long n = 0; n < count; n += WIDTH) {
-        vec x = load(over + n);
-        store(sum + n, load(sum + n) + 2.0f * x * x);
+        vec x = -larger(-load(over + n), all(-most));
+        store(sum + n, load(sum + n) + scale * x * x);
     }
 }
 
 /* The squares themselves, none more than `rate` times what is there, plus `offset`. */
-STEP void blend_squares(long count, float share, float rate, float offset, const float *over, float *spread)
+STEP void blend_squares(long count, float share, float scale, float rate, float offset, const float *over,
+                        float *spread)
 {
     for (long n = 0; n < count; n += WIDTH) {
         vec x = load(over + n), old = load(spread + n), most = rate * old + offset;
-        store(spread + n, (1.0f - share) * old - share * larger(-2.0f * x * x, -most));
+        store(spread + n, (1.0f - share) * old - share * larger(-scale * x * x, -most));
     }
 }
 

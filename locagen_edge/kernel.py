@@ -306,9 +306,9 @@ class Steered:
         """
         _check(lib.locagen_steer_settle(self._state, span, share))
 
-    def doubt(self, share: float, most: float, span: int = 0) -> None:
+    def doubt(self, share: float, growth: float, span: int = 0) -> None:
         """Instead of `watch`, while something may call: drops what was put aside, keeps little in mind."""
-        _check(lib.locagen_steer_doubt(self._state, span, share, most))
+        _check(lib.locagen_steer_doubt(self._state, span, share, growth))
 
     def weigh(self, weight: npt.NDArray[np.float32]) -> None:
         """Weights 0 to 1 of all bins in the band, float32, shape `(bins,)`, for the searches to come."""

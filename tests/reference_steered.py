@@ -79,7 +79,9 @@ class Reference:
     ) -> float:
         """By whitening with Cholesky's factor; noise as `loaded` gives it."""
         whitener = np.linalg.inv(np.linalg.cholesky(noise))
-        x = whitener @ signal @ whitener.conj().transpose(0, 2, 1)
+        n, mics = self.noise_looks, noise.shape[1]
+        unbiased = max(0.25, (1 - (mics - 1) / n) * (1 - mics / n))
+        x = unbiased * (whitener @ signal @ whitener.conj().transpose(0, 2, 1))
         a = np.einsum("kij,kj->ki", whitener, self.phases(u))
         for v in nulls:
             b = np.einsum("kij,kj->ki", whitener, self.phases(v))

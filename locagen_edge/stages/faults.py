@@ -46,18 +46,20 @@ class DelayFit:
         flat = len(thickness) < 3 or thickness[2] < FLAT_M
         self._slope: F64 = baselines @ axes[: 2 if flat else 3].T / settings.speed_m_s
         self._inverse: F64 = np.linalg.pinv(self._slope)
-        self._spare = len(baselines) - self._slope.shape[1]
         self._tolerance_s = math.sqrt(2.0) * settings.array.tolerance_m / settings.speed_m_s
 
     def misfit(self, tdoa: Tdoa) -> float:
         """rms of (measured - fitted) delay over its sigma, by least squares for u with |u| at most 1; 0
-        where there are no more delays than unknowns, or one is missing."""
-        if self._spare < 1 or not np.isfinite(tdoa.delay_s).all():
+        where there are no more delays than unknowns."""
+        heard = np.isfinite(tdoa.delay_s)
+        slope, delay = self._slope[heard], tdoa.delay_s[heard]
+        spare = len(delay) - slope.shape[1]
+        if spare < 1:
             return 0.0
-        u = self._inverse @ tdoa.delay_s
+        u = (self._inverse if heard.all() else np.linalg.pinv(slope)) @ delay
         u /= max(1.0, float(np.linalg.norm(u)))
-        off = (tdoa.delay_s - self._slope @ u) / np.hypot(tdoa.sigma_s, self._tolerance_s)
-        return math.sqrt(float(off @ off) / self._spare)
+        off = (delay - slope @ u) / np.hypot(tdoa.sigma_s[heard], self._tolerance_s)
+        return math.sqrt(float(off @ off) / spare)
 
 
 def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, misfit: float) -> set[str]:

@@ -21,7 +21,7 @@ from locagen_edge.types import F32
 
 SCORE = 20.0
 """Added to the average: the least that noise gives, however still it keeps."""
-YOUNG, YOUNG_S = 600.0, 1.2
+YOUNG, YOUNG_S = 600.0, 1.6
 """Added while the noise has just been learnt and is hardly known: falls by e in each of these times."""
 MEMORY_S = 20.0
 LOUDEST = 2.0
@@ -30,6 +30,10 @@ CLIP = 60.0
 """A frame's score counts up to here, so that one clap does not outweigh a second of voice."""
 DRIFT = 3.0
 """By how much a frame of a call is above what is usual, at least."""
+LEAST_USUAL = 4.0
+"""What a frame of noise scores in one direction, at least."""
+SHARE = 0.25
+"""The same as a share of the highest of late: the louder the call, the sharper its begin."""
 RECENT_S = 0.3
 HISTORY_S = 2.0
 RISE_S = 0.08
@@ -54,7 +58,12 @@ class Usual:
     @property
     def level(self) -> float:
         """The score whose ratio is 1."""
-        return SCORE + self._youth + (self._sum / self._weight if self._weight else 0.0)
+        return self.known + self._youth
+
+    @property
+    def known(self) -> float:
+        """The same without what is added for the noise being hardly known yet."""
+        return SCORE + (self._sum / self._weight if self._weight else 0.0)
 
     def learn(self, score: float, elapsed_s: float) -> None:
         self._youth *= math.exp(-elapsed_s / YOUNG_S)
@@ -93,11 +102,15 @@ class Onsets:
 
     def going_on(self, direction: int) -> bool:
         """Whether it still calls from there: an average over a second remembers what has ended."""
-        return float(self._towards(direction)[-self._recent :].mean()) > DRIFT
+        usual = LEAST_USUAL if self._usual is None else max(float(self._usual[direction]), LEAST_USUAL)
+        recent = list(self._history)[-self._recent :]
+        return float(np.mean([scores[direction] for scores in recent])) > usual + DRIFT
 
     def since_s(self, direction: int) -> float:
         """For how long it has called from there, at the last frame's end; `HISTORY_S` at most."""
-        from_the_end = np.cumsum(self._towards(direction)[::-1] - DRIFT)
+        above = self._towards(direction)
+        drift = max(DRIFT, SHARE * float(above[-self._recent :].max()))
+        from_the_end = np.cumsum(above[::-1] - drift)
         return int(from_the_end.argmax()) * self._hop_s + RISE_S
 
     def forget(self) -> None:

@@ -36,13 +36,20 @@ LAG_S = 0.5
 """Noise is learnt so late: by then a call is known as one, and its beginning is not learnt."""
 MEANING = 1.6
 """Evidence from which a direction means something, though not yet a call."""
-UNUSUAL = 9.0
-"""Times the usual spread: more is not believed of what may be a call."""
+GROWTH_S = 2.0
+"""Noise that is taken for calls ceases to be: what is kept in mind of it grows by e in this time at most."""
 WATCH_S = 15.0
 LOUDER = -0.5
 """Contrast over score below which all of the noise has become louder: about -2 where it has, 0 for a call."""
-SECOND = 0.1
-"""Least score of a second caller beside the first one's: below it lies what a null leaves of the first."""
+PAUSE_S = 0.3
+"""From a loud caller's last sound on he counts as silent: longer than the pauses between syllables."""
+FLAT = 0.8
+"""Least score over the best from which all directions are alike: noise far louder than what was learnt."""
+SILENCE = 1e-11
+"""-110 dBFS mean square in the band: a muted input teaches nothing."""
+SECOND = 0.2
+"""Least score of a second caller beside the first one's, who has to be a call by himself too: below it lies
+what a null leaves of the first."""
 
 
 class SteeredLocator:
@@ -72,7 +79,7 @@ class SteeredLocator:
             [direction(float(a), float(e)) for a, e in zip(columns.ravel(), rows.ravel(), strict=True)]
         )
         self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
-        self._looks = LOOKS * settings.mic_array.mics
+        self._mics = settings.mic_array.mics
         self._elapsed_s = 0.0
         # A microphone that fails for a moment must not be missing from the matrix for long after; one that
         # has failed for good must not keep the others from learning.
@@ -81,13 +88,23 @@ class SteeredLocator:
         self._know_nothing()
 
     def _know_nothing(self) -> None:
-        self._to_learn = self._looks
-        self._usual = tuple(Usual() for _ in self._spans_s)
+        """Neither noise nor what has just been heard."""
+        self._begin_anew()
         self._onsets = Onsets(self._hop_s)
         self._scores = [0.0 for _ in self._spans_s]
+        self._strange = [False for _ in self._spans_s]
+        self._strange_hops = 0
+        self._loud_hops_ago: int | None = None
         self._failing: deque[bool] = deque(maxlen=self._lag + 1)
+        self._silent: deque[bool] = deque(maxlen=self._lag + 1)
         self._quiet_hops = 0
         self._since_lag: deque[float] = deque([0.0], maxlen=self._lag + 1)
+
+    def _begin_anew(self) -> None:
+        """Noise of another kind: what was learnt says nothing of it."""
+        self._learnt_frames = 0
+        self._to_learn = LOOKS * self._mics
+        self._usual = tuple(Usual() for _ in self._spans_s)
 
     def apply(self, settings: Settings, /) -> None:
         """Limit and memories as these settings say; what was learnt of the noise stays."""
@@ -106,12 +123,14 @@ class SteeredLocator:
         failing = bad_mics != 0 or power.min() < DEAD * power.max()
         self._bad_hops = self._bad_hops + 1 if failing else 0
         self._failing.append(bool(failing))
+        self._silent.append(bool(power.max() < SILENCE))
         self._elapsed_s = elapsed_s
         if elapsed_s > LAG_S:
             self._onsets.forget()
         found = [self._heard(span, elapsed_s) for span in range(len(self._spans_s))]
         if self._to_learn > 0:
             return (no_bearing(NAME),)
+        self._end_of_a_loud_call()
         return self._best(found) or (no_bearing(NAME, Evidence(min(max(self._ratios()), MEANING), 0.0)),)
 
     def _best(self, found: list[list[Source]]) -> tuple[Bearing, ...]:
@@ -130,6 +149,18 @@ class SteeredLocator:
                 return tuple(self._told(source, span, evidence) for source in found[span])
         return ()
 
+    def _end_of_a_loud_call(self) -> None:
+        """Who was heard frame by frame and is not any more has stopped: the average begins anew."""
+        if self._ratios()[0] >= self._least_ratio:
+            self._loud_hops_ago = 0
+        elif self._loud_hops_ago is not None:
+            self._loud_hops_ago += 1
+            if self._loud_hops_ago * self._hop_s > PAUSE_S:
+                self._loud_hops_ago = None
+                for span, span_s in enumerate(self._spans_s):
+                    if span_s > 0.0:
+                        self._search.hear(1.0, span)
+
     def _ratios(self) -> list[float]:
         """How the best score of each span stands out."""
         return [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
@@ -138,17 +169,19 @@ class SteeredLocator:
         """The callers in one span; none where the noise alone is as good a reason."""
         span_s = self._spans_s[span]
         self._search.hear(1.0 - math.exp(-elapsed_s / span_s) if span_s > 0.0 else 1.0, span)
-        sources = self._search.search(2, span, MEANING * self._usual[span].level)
+        sources = self._search.search(2, span, MEANING * self._usual[span].known)
         scores: F32 = self._search.map(span)
         if span == 0:
             self._onsets.hear(scores)
         self._scores[span] = max(float(scores.max()), sources[0].score if sources else 0.0)
+        self._strange[span] = False
         if not sources:
             return []
-        if sources[0].contrast < LOUDER * sources[0].score:
-            self._scores[span] = 0.0
+        if sources[0].contrast < LOUDER * sources[0].score or scores.min() > FLAT * scores.max():
+            self._scores[span], self._strange[span] = 0.0, True
             return []
-        return [s for s in sources if s.score > SECOND * sources[0].score]
+        least = max(SECOND * sources[0].score, self._least_ratio * self._usual[span].level)
+        return [s for n, s in enumerate(sources) if n == 0 or s.score > least]
 
     def _nearest(self, source: Source) -> int:
         """On the grid."""
@@ -179,10 +212,16 @@ class SteeredLocator:
         """
         if self._to_learn <= 0:
             self._watch(call)
-        if len(self._failing) > self._lag and (not self._failing[0] or self._bad_hops > self._patience):
+            self._strange_hops = self._strange_hops + 1 if self._strange[0] else 0
+            if self._strange_hops > self._lag:  # rotors have started: every frame in the ring is of now
+                self._begin_anew()
+        patient = self._to_learn <= 0 and self._bad_hops <= self._patience
+        if len(self._failing) > self._lag and not (self._silent[0] or (patient and self._failing[0])):
             surest = max(self._since_lag) if self._to_learn <= 0 else 0.0
             caution = min(1.0, (self._least_ratio / max(surest, 1e-9)) ** 2)
-            self._search.learn(caution * (1.0 - math.exp(-self._elapsed_s / self._forget_s)))
+            share = max(1.0 - math.exp(-self._elapsed_s / self._forget_s), 1.0 / (self._learnt_frames + 1))
+            self._search.learn(caution * share)
+            self._learnt_frames += 1
             self._to_learn = max(self._to_learn - 1, 0)
 
     def _watch(self, call: bool) -> None:
@@ -192,9 +231,10 @@ class SteeredLocator:
         self._quiet_hops = 0 if call else self._quiet_hops + 1
         for span in range(len(self._spans_s)):
             if call:
-                self._search.doubt(share, UNUSUAL, span)
+                self._search.doubt(share, self._hop_s / GROWTH_S, span)
                 continue
-            self._search.watch(span)
+            if not self._strange[span]:
+                self._search.watch(span)
             if self._quiet_hops % self._lag == 0:
                 self._search.settle(share, span)
         for usual, score in zip(self._usual, self._scores, strict=True):
