@@ -76,21 +76,23 @@ class SteeredLocator:
         self._grid_u = np.stack(
             [direction(float(a), float(e)) for a, e in zip(columns.ravel(), rows.ravel(), strict=True)]
         )
-        self._least_ratio = settings.detection.evidence
-        self._forget_s = steered.forget_s
-        self._patience = steered.forget_s / hop_s
         self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
         self._mics = settings.mic_array.mics
-        self._begin_anew()
-        self._onsets = Onsets(hop_s)
-        self._scores = [0.0 for _ in self._spans_s]
-        self._strange = [False for _ in self._spans_s]
-        self._strange_hops = 0
-        self._loud_hops_ago: int | None = None
         self._elapsed_s = 0.0
         # A microphone that fails for a moment must not be missing from the matrix for long after; one that
         # has failed for good must not keep the others from learning.
         self._bad_hops = 0
+        self.apply(settings)
+        self._know_nothing()
+
+    def _know_nothing(self) -> None:
+        """Neither noise nor what has just been heard."""
+        self._begin_anew()
+        self._onsets = Onsets(self._hop_s)
+        self._scores = [0.0 for _ in self._spans_s]
+        self._strange = [False for _ in self._spans_s]
+        self._strange_hops = 0
+        self._loud_hops_ago: int | None = None
         self._failing: deque[bool] = deque(maxlen=self._lag + 1)
         self._silent: deque[bool] = deque(maxlen=self._lag + 1)
         self._quiet_hops = 0
@@ -101,6 +103,18 @@ class SteeredLocator:
         self._learnt_frames = 0
         self._to_learn = LOOKS * self._mics
         self._usual = tuple(Usual() for _ in self._spans_s)
+
+    def apply(self, settings: Settings, /) -> None:
+        """Limit and memories as these settings say; what was learnt of the noise stays."""
+        self._least_ratio = settings.detection.evidence
+        self._spans_s = (0.0, settings.steered.span_s)
+        self._forget_s = settings.steered.forget_s
+        self._patience = settings.steered.forget_s / self._hop_s
+
+    def forget(self) -> None:
+        """Begins anew with the noise's matrix."""
+        self._search.reset()
+        self._know_nothing()
 
     def __call__(self, frame: Frame, _: Tdoa, elapsed_s: float, /) -> tuple[Bearing, ...]:
         power, bad_mics = self._search.listen(frame.samples)
