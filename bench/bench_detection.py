@@ -4,9 +4,9 @@
 
 The pipeline as it flies, with the default settings. Noise alone: streams of 5 minutes, of which the first
 10 s (of learning) are told apart; a false call is one that begins. Calls: one of 1 s, after 14 s of noise,
-found when a frame of it is taken for a call; the onset as told with the last such frame; the error of the track
-then, and of the last bearing of all calls (a guess, 90 degrees, where there is none); sigma: share of the
-bearings in calls within 1 and 2 of their sigmas.
+found when a frame of it is taken for a call; the onset as told with the last such frame; the error of the
+track then, and of the last bearing of all calls (a guess, 90 degrees, where there is none); sigma: share of
+the bearings in calls within 1 and 2 of their sigmas.
 """
 
 from __future__ import annotations
