@@ -123,6 +123,9 @@ typedef struct {
  * contrast: the same for the strongest source against "all of the noise has become louder": below 0 where
  * rotors rise, wind or a touch of the microphones is the better reason.
  *
+ * rival: of the strongest source, score of the best direction in another lobe over its own: near 1 where a narrow
+ * sound has several answers, for microphones farther apart than half of its wavelength.
+ *
  * snr: per microphone, power ratio: (mean q - 1) / microphones, 0 or more. Under coloured noise: that of white
  * noise in which the source would be as well seen.
  *
@@ -135,6 +138,7 @@ typedef struct {
     float elevation_rad; /* positive up; of two images that a flat array cannot tell apart the lower one */
     float score;
     float contrast;
+    float rival;
     float snr;
     float information[3];
 } locagen_source;

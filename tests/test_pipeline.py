@@ -392,6 +392,19 @@ def test_a_channel_that_dies_in_flight_gives_no_sure_wrong_bearing(mic):
     assert estimates[-1].faults == (f"microphone {mic}: dead, hears nothing",)
 
 
+def test_a_whistle_is_a_call_without_a_sure_wrong_bearing():
+    """3 kHz: 10 cm are nearly a wavelength, and several directions explain it alike."""
+    settings = Settings()
+    rate = settings.audio.rate_hz
+    noise = 0.05 * np.random.default_rng(1).standard_normal((3, 8 * rate)).astype(np.float32)
+    for azimuth in (0.5, 2.5, 4.4):
+        call = CALLS["whistle"](rate, rate, 4800.0, np.random.default_rng(2))
+        mixed = call_over_noise(settings, call, noise, rate, 6.0, azimuth, 0.0).astype(np.float32)
+        inside = [e for e in process(settings, mixed) if 6.0 <= e.t_ns * 1e-9 < 6.9]
+        assert np.mean([e.detection.call for e in inside]) > 0.9
+        never_sure_and_wrong(inside, azimuth)
+
+
 def test_a_source_straight_below_has_no_azimuth_to_be_sure_of():
     settings = Settings()
     sound = after_noise(settings, heard(settings, 1.0, -math.pi / 2, 15.0, 8192), 15.0, hops=80)

@@ -772,3 +772,15 @@ def test_weights_choose_the_bins_that_count() -> None:
             whole.weigh(wrong.astype(np.float32))
     with pytest.raises(KernelError, match="float32"):
         whole.weigh(np.ones(3, np.float32))
+
+
+def test_a_narrow_sound_of_short_waves_has_rivals() -> None:
+    """At 3 kHz 10 cm are 0.9 wavelengths: a whistle has several answers, a voice one."""
+    rng = np.random.default_rng(6)
+    found = steered()
+    learn(found, [hiss(rng) for _ in range(100)])
+    for azimuth in (0.3, 2.0, 4.5):
+        (whistle,) = heard(found, hiss(rng) + wave(rng, azimuth, -0.4, level=0.03, band_hz=(2950.0, 3050.0)))
+        (voice,) = heard(found, hiss(rng) + wave(rng, azimuth, -0.4, level=0.03, band_hz=(400.0, 2500.0)))
+        assert whistle.rival > 0.93
+        assert voice.rival < 0.8

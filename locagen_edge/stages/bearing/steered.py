@@ -45,6 +45,9 @@ FLAT = 0.8
 """Least score over the best from which all directions are alike: noise far louder than what was learnt."""
 SILENCE = 1e-11
 """-110 dBFS mean square in the band: a muted input teaches nothing."""
+RIVAL = 0.9
+"""Score of another lobe over the best from which nobody knows which is true: 0.96 and more for a whistle of
+3 kHz, whose wavelength is shorter than twice the array; under 0.7 for voices."""
 SECOND = 0.2
 """Least score of a second caller beside the first one's, who has to be a call by himself too: below it lies
 what a null leaves of the first."""
@@ -187,6 +190,8 @@ class SteeredLocator:
         return int(np.argmax(self._grid_u @ direction(source.azimuth_rad, source.elevation_rad)))
 
     def _told(self, source: Source, span: int, evidence: Evidence) -> Bearing:
+        if source.rival > RIVAL:
+            return no_bearing(NAME, evidence)
         azimuth_sigma, elevation_sigma = source.sigma_rad()
         # positions that are off turn a source below by as much over cos(elevation)
         tolerance = self._tolerance / max(math.cos(source.elevation_rad), 0.1)
