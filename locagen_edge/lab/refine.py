@@ -7,9 +7,9 @@ score, and answers with a correction of azimuth and elevation and with new sigma
 estimator's own sigmas: in the free field "nothing to do" is zero.
 
 It is judged against the estimator on the same calls, on seeds not trained on and, by a network that is
-trained without it, on each kind of disturbance as one never met. Loss: the Gaussian's negative log-likelihood with
-mean and variance both learnt (Nix & Weigend, "Estimating the mean and variance of the target probability
-distribution", ICNN 1994).
+trained without it, on each kind of disturbance as one never met. Loss: the Gaussian's negative log-likelihood
+with mean and variance both learnt (Nix & Weigend, "Estimating the mean and variance of the target
+probability distribution", ICNN 1994).
 """
 
 from __future__ import annotations
