@@ -21,7 +21,7 @@ def add_command(subparsers: Any) -> None:
         help="a network that corrects the steered estimator, judged beside it",
         description="Train a network on the score maps of the estimator `steered` under the twin's "
         "disturbances, and judge it beside the estimator on calls of other seeds and on disturbances that it "
-        "has not met. Writes report.md, report.json. Takes some minutes.",
+        "has not met. Writes report.md, report.json. Takes some ten minutes.",
     )
     parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML file (default: built in)")
     parser.add_argument("--out", type=Path, default=Path("refine-report"), metavar="DIR",
