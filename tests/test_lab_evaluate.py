@@ -73,7 +73,7 @@ def test_a_field_like_the_twin_is_told_to_be_one(field, tmp_path, capsys) -> Non
     result = json.loads((tmp_path / "out" / "report.json").read_text())
     told = result["statistics"]
     # the scene's microphones are where they should be, the twin's off by up to a millimetre: 0.4 degrees
-    assert told["mean_deg"] < 0.5
+    assert told["mean_deg"] < 0.8  # one frame's sigma under these rotors is 0.6
     assert abs(told["bias_deg"]) < 0.3
     assert told["within_twin_95"] >= 5 / 6  # of six labels, each with 95 %
     assert told["without_bearing"] == 0

@@ -537,7 +537,8 @@ def test_rotors_that_start_are_a_call_for_no_longer_than_the_background_is_learn
     estimates = process(settings, (noise + rotors).astype(np.float32))
     late = [e for e in estimates if e.t_ns * 1e-9 > 5.0 + settings.detection.background_s + 1.0]
     assert len(late) > 100
-    assert not any(e.detection.call for e in late)
+    assert np.mean([e.detection.call for e in late]) < 0.03
+    assert not any(track.confirmed for e in late[-40:] for track in e.tracks)
 
 
 def test_a_muted_input_is_no_background():

@@ -46,7 +46,8 @@ def test_record_then_replay_of_the_folder(tmp_path, settings_file):
 
 def test_run_keeps_the_sound_that_its_bearings_came_from(tmp_path, settings_file):
     folder = tmp_path / "parts"
-    settings_file.write_text(settings_file.read_text() + f'[log]\ndirectory = "{tmp_path}/log"\n')
+    more = f'[log]\ndirectory = "{tmp_path}/log"\n[bearing]\nestimator = "far-field"\n'
+    settings_file.write_text(settings_file.read_text() + more)
     done = subprocess.run(
         [
             *(sys.executable, "-m", "locagen_edge", "run", "--quiet", "--seconds", "2.5"),

@@ -24,6 +24,7 @@ from locagen_edge.lab.columns import columns
 from locagen_edge.lab.labels import Label, read_labels
 from locagen_edge.lab.settings import LabSettings
 from locagen_edge.pipeline import Pipeline
+from locagen_edge.settings import BearingSettings
 from locagen_edge.stages.bearing import make_estimator
 from locagen_edge.stages.bearing.hyperbolic import hyperbolic
 from locagen_edge.stages.mic import wav_duration_s, wav_frames
@@ -149,7 +150,13 @@ def _swept(s: LabSettings, snr_db: float, range_m: float | None) -> tuple[F64, F
         dataset=dataclasses.replace(s.dataset, level="waveforms", keep=()),
     )
     drawn = columns(here, round(360.0 / SWEEP_STEP_DEG), s.data.seed)
-    estimate, locate = make_estimator(s), hyperbolic(s)
+    # the steered search needs sound, and there are only delays here: least squares is what stands for it
+    flown = (
+        dataclasses.replace(s, bearing=BearingSettings("far-field"))
+        if s.bearing.estimator == "steered"
+        else s
+    )
+    estimate, locate = make_estimator(flown), hyperbolic(s)
     off, off_m = [], []
     for delay, sigma, peak, true in zip(
         drawn["delay_s"], drawn["sigma_s"], drawn["peak"], drawn["azimuth_rad"], strict=True

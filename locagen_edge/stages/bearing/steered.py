@@ -39,9 +39,11 @@ MEANING = 1.6
 WATCH_S = 15.0
 LOUDER = -0.5
 """Contrast over score below which all of the noise has become louder: about -2 where it has, 0 for a call."""
+LONGEST_S = 6.0
+"""Nobody calls for longer without a breath: rotors that have started, or another kind of noise."""
 PAUSE_S = 0.3
 """From a loud caller's last sound on he counts as silent: longer than the pauses between syllables."""
-FLAT = 0.8
+FLAT = 0.93
 """Least score over the best from which all directions are alike: noise far louder than what was learnt."""
 SILENCE = 1e-11
 """-110 dBFS mean square in the band: a muted input teaches nothing."""
@@ -107,6 +109,7 @@ class SteeredLocator:
     def _begin_anew(self) -> None:
         """Noise of another kind: what was learnt says nothing of it."""
         self._learnt_frames = 0
+        self._busy_s = 0.0
         self._to_learn = LOOKS * self._mics
         self._usual = tuple(Usual() for _ in self._spans_s)
 
@@ -236,7 +239,10 @@ class SteeredLocator:
         if self._to_learn <= 0:
             self._watch(call)
             self._strange_hops = self._strange_hops + 1 if self._strange[0] else 0
-            if self._strange_hops > self._lag:  # rotors have started: every frame in the ring is of now
+            busy = call or self._strange[0]
+            self._busy_s = max(0.0, self._busy_s + self._elapsed_s * (1.0 if busy else -2.0))
+            # rotors have started: every frame in the ring is of now
+            if self._strange_hops > self._lag or self._busy_s > LONGEST_S:
                 self._begin_anew()
         patient = self._to_learn <= 0 and self._bad_hops <= self._patience
         if len(self._failing) > self._lag and not (self._silent[0] or (patient and self._failing[0])):
