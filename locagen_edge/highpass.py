@@ -1,9 +1,10 @@
 """A high-pass for a stream of blocks, without a loop over samples.
 
 Fourth-order Butterworth from two biquads (Bristow-Johnson, "Cookbook formulae for audio EQ biquad filter
-coefficients"; Q of a fourth order: 0.541 and 1.307). A block is one product of matrices: what the block's samples do
-to its output, and what the four numbers that the filter remembers do (the filter's state space, as in Oppenheim &
-Schafer, Discrete-Time Signal Processing, 6.3, run for a whole block). So how a stream is cut does not show.
+coefficients"; Q of a fourth order: 0.541 and 1.307). A block is one product of matrices: what the block's
+samples do to its output, and what the four numbers that the filter remembers do (the filter's state space, as
+in Oppenheim & Schafer, Discrete-Time Signal Processing, 6.3, run for a whole block). So how a stream is cut
+does not show.
 """
 
 from __future__ import annotations
@@ -56,7 +57,9 @@ def _coefficients(corner_hz: float, rate_hz: float) -> tuple[F64, F64]:
 
 
 def _block(b: F64, a: F64) -> tuple[F64, F64, F64, F64]:
-    """State space (transposed direct form II) over BLOCK samples: y = forced x + free z, z' = driven x + kept z."""
+    """State space (transposed direct form II) over BLOCK samples: y = forced x + free z, z' = driven x +
+    kept z.
+    """
     order = len(a) - 1
     step = np.zeros((order, order))
     step[:-1, 1:] = np.eye(order - 1)

@@ -131,7 +131,7 @@ def _check_hash(name: str, content: bytes, wanted: str) -> None:
 
 
 def _check_array(name: str, positions_m: Any, settings: Settings) -> None:
-    """Only the shape counts: where the array sits, and 1 mm, make no difference to delays. None: any array."""
+    """Only the shape counts: where the array sits, and 1 mm, do not matter to delays. None: any array."""
     if positions_m is None:
         return
     wanted = np.asarray(positions_m, dtype=np.float64)

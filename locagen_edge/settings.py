@@ -181,13 +181,16 @@ class DenoiseSettings:
 
     kind: str = setting(
         "none",
-        "`wave`: every microphone's sound goes through the paper's network before it is correlated, and comes "
+        "`wave`: every microphone's sound goes through the paper's network before it is correlated, and "
+        "comes "
         "6 ms later. `mask`: the sound stays as it is, and a mask says which frequencies are the caller's.",
         choices=("none", "wave", "mask"),
     )
     wave: str = setting("denoise-wave", "The model of `wave`.", pattern=NAME)
     mask: str = setting(
-        "denoise-mask", "The model of `mask`; `locagen-lab denoise tune` makes one for your drone.", pattern=NAME
+        "denoise-mask",
+        "The model of `mask`; `locagen-lab denoise tune` makes one for your drone.",
+        pattern=NAME,
     )
     forget_s: float = setting(
         4.0,

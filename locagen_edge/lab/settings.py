@@ -153,7 +153,8 @@ class MixesSettings:
     )
     alter: float = setting(
         1.0,
-        "How much noise recordings are altered in speed, colour and loudness: 1 makes other drones of them, for "
+        "How much noise recordings are altered in speed, colour and loudness: 1 makes other drones of "
+        "them, for "
         "a network that has to meet unknown ones; less keeps known drones as they are.",
         least=0, most=1,
     )  # fmt: skip
@@ -196,11 +197,17 @@ class MaskSettings(FitSettings):
     """The denoiser that serves the bearing: one mask for all microphones, told the noise's spectrum."""
 
     width: int = setting(40, "Numbers that describe a band.", least=4, most=1024)
-    blocks: int = setting(2, "Pairs of a recurrent layer over time and a dense one over bands.", least=1, most=8)
+    blocks: int = setting(
+        2, "Pairs of a recurrent layer over time and a dense one over bands.", least=1, most=8
+    )
     batch: int = setting(12, "Clips in a step.", unit="clips", least=1, most=4096)
     rate: float = setting(3e-3, "First learning rate of AdamW.", least=1e-7, most=1)
     gain_weight: float = setting(
-        2.0, "Weight of (1 - gain on the call)^2 beside the SI-SDR in units of 10 dB.", least=0, most=1000
+        2.0,
+        "Weight of (1 - gain on the call)^2, times the call's share of the mixture, beside the SI-SDR in "
+        "units of 10 dB.",
+        least=0,
+        most=1000,
     )
 
 

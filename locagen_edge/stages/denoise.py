@@ -1,15 +1,15 @@
 """Frame -> Frame, or Frame -> Mask: takes the rotors out of the sound and leaves caller and phases.
 
     wave    the paper's network: each microphone's waveform through the same weights. The sound comes out
-            WAVE_DELAY samples later. Bearings from it want a correlation that does not whiten: PHAT divides out
-            just what the denoiser did.
-    mask    one mask for all microphones in time and frequency, from their spectra over that of the noise, which is
-            learnt while nothing calls. It touches no phase: weigh cross-spectra with it, tell calls by it, or hear
-            the cleaned sound, MASK_DELAY samples later.
+            WAVE_DELAY samples later. Bearings from it want a correlation that does not whiten: PHAT divides
+            out just what the denoiser did.
+    mask    one mask for all microphones in time and frequency, from their spectra over that of the noise,
+    which is learnt while nothing calls. It touches no phase: weigh cross-spectra with it, tell calls by it,
+    or hear the cleaned sound, MASK_DELAY samples later.
 
-Both hear everything through the same high-pass, keep their state from frame to frame, and begin anew after a gap. A
-sample that is not finite counts as silence inside, and is not finite again in the sound that comes out, so that the
-microphone's failure is seen by those who look for it and spoils nothing later.
+Both hear everything through the same high-pass, keep their state from frame to frame, and begin anew after
+a gap. A sample that is not finite counts as silence inside, and is not finite again in the sound that comes
+out, so that the microphone's failure is seen by those who look for it and spoils nothing later.
 """
 
 from __future__ import annotations
@@ -125,13 +125,12 @@ class WaveDenoiser:
             self._failed[:] = 0.0
         new = sound.shape[1]
         self._held = _shifted(self._held, self._stream(sound))
-        self._failed = _shifted(self._failed, frame.samples[:, -new:] * np.float32(0.0))
-        # 0 where the input was finite, NaN where not
+        # 0 where the input is finite, NaN where not
+        failed = np.where(np.isfinite(frame.samples[:, -new:]), np.float32(0.0), np.float32(np.nan))
+        self._failed = _shifted(self._failed, failed)
         samples = self._held + self._failed[:, : self._held.shape[1]]
         earlier_ns = round(WAVE_DELAY * 1e9 / frame.rate_hz)
-        return replace(
-            frame, samples=samples, start=frame.start - WAVE_DELAY, t_ns=frame.t_ns - earlier_ns
-        )
+        return replace(frame, samples=samples, start=frame.start - WAVE_DELAY, t_ns=frame.t_ns - earlier_ns)
 
 
 def _shifted(held: F32, new: F32) -> F32:
@@ -194,10 +193,8 @@ class MaskStream:
         pieces = np.lib.stride_tricks.sliding_window_view(long, WINDOW, axis=1)[:, ::STEP]
         spectra = np.fft.rfft(pieces * self._taper, axis=2)
         power = np.square(spectra.real) + np.square(spectra.imag)
-        masks = []
-        for first in range(0, power.shape[1], CHUNK // STEP):
-            masks.append(self._mask(power[:, first : first + CHUNK // STEP]))
-        return spectra, np.concatenate(masks)
+        at = range(0, power.shape[1], CHUNK // STEP)
+        return spectra, np.concatenate([self._mask(power[:, k : k + CHUNK // STEP]) for k in at])
 
     def _mask(self, power: F64) -> F32:
         noise = self.noise.mean
@@ -210,7 +207,11 @@ class MaskStream:
         relative = np.minimum((power[live] / known[:, np.newaxis]).mean(axis=0), 1e12)
         shape = (known / known.sum(axis=1, keepdims=True)).mean(axis=0)
         found, *self._states = self._network(
-            [relative[np.newaxis, :, 1:].astype(np.float32), shape[np.newaxis, 1:].astype(np.float32), *self._states]
+            [
+                relative[np.newaxis, :, 1:].astype(np.float32),
+                shape[np.newaxis, 1:].astype(np.float32),
+                *self._states,
+            ]
         )
         mask[:, 1:] = found[0]
         mask[:, 0] = 0.0
@@ -223,16 +224,19 @@ class MaskStream:
         pieces = np.fft.irfft(waiting[:, : spectra.shape[1]] * mask, axis=2) * self._taper
         before = np.concatenate([self._overlap[:, np.newaxis], pieces[:, :-1, STEP:]], axis=1)
         self._overlap = pieces[:, -1, STEP:]
-        return (pieces[:, :, :STEP] + before).reshape(self._mics, -1).astype(np.float32)
+        clean: F32 = (pieces[:, :, :STEP] + before).reshape(self._mics, -1).astype(np.float32)
+        return clean
 
 
 class MaskDenoiser:
-    """Frames to masks. Tell it by `settle` whether the frame was a call: if not, it is noise to learn from."""
+    """Frames to masks. `settle` tells it whether the frame was a call: if not, it is noise to learn from."""
 
     def __init__(self, settings: Settings) -> None:
         mics, audio = settings.mic_array.mics, settings.audio
         self._new = NewSound(mics)
-        self._stream = MaskStream(load_network(settings.denoise.mask, settings), mics, settings.denoise.forget_s)
+        self._stream = MaskStream(
+            load_network(settings.denoise.mask, settings), mics, settings.denoise.forget_s
+        )
         self._frame = audio.frame
         per_frame = (audio.frame - WINDOW) // STEP + 1
         self._masks: F32 = np.ones((per_frame, BINS + 1), dtype=np.float32)
@@ -263,7 +267,12 @@ class MaskDenoiser:
         call = float((masks * heard)[:, self._band].sum())
         rest = float(((1.0 - masks) * heard)[:, self._band].sum())
         ready = bool((self._stream.noise.spectra * STEP >= EARLIEST_S * RATE_HZ).any())
-        return Mask(frame.t_ns, weight, masks, 10.0 * math.log10((call + LEAST) / (rest + LEAST)) if ready else -math.inf)
+        return Mask(
+            frame.t_ns,
+            weight,
+            masks,
+            10.0 * math.log10((call + LEAST) / (rest + LEAST)) if ready else -math.inf,
+        )
 
     def settle(self, call: bool, /) -> None:
         """Learns the frame's new spectra as noise where it held no call."""

@@ -1,7 +1,7 @@
 """Calls for training and evaluation: those of the simulator, in more voices and with pauses.
 
-The simulator's screams lie round 1 kHz and its whistles round 3 kHz, which a network would learn by heart. Here
-each has its own pitch, colour and rhythm; whistles come with a pea, and blown through fingers.
+The simulator's screams lie round 1 kHz and its whistles round 3 kHz, which a network would learn by heart.
+Here each has its own pitch, colour and rhythm; whistles come with a pea, and blown through fingers.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ def _in_bursts(sound: F64, rate_hz: float, rng: np.random.Generator) -> F64:
     while start < n:
         length = int(rate_hz * rng.uniform(0.4, 1.6))
         rise = np.minimum(np.arange(length) / (0.03 * rate_hz), 1.0)
-        envelope = np.minimum(rise, rise[::-1]) * np.interp(np.arange(length), [0, length], rng.uniform(0.4, 1.0, 2))
+        envelope = np.minimum(rise, rise[::-1]) * np.interp(
+            np.arange(length), [0, length], rng.uniform(0.4, 1.0, 2)
+        )
         loudness[start : start + length] = envelope[: n - start]
         start += length + int(rate_hz * rng.uniform(0.1, 0.5))
     return sound * loudness

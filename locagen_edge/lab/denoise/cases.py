@@ -1,7 +1,8 @@
-"""The mixes by which denoisers are judged: recordings and drones that no training heard, the same for every method.
+"""The mixes by which denoisers are judged: recordings and drones that no training heard, the same for every
+method.
 
-Each case is noise alone and then noise with a call in it; the same case at every SNR. `with_array` gives it the
-geometry of an array, for bearings.
+Each case is noise alone and then noise with a call in it; the same case at every SNR. `with_array` gives it
+the geometry of an array, for bearings.
 """
 
 from __future__ import annotations
@@ -90,7 +91,9 @@ def case(
     while len(sound) < before + n:
         sound = np.concatenate([sound, sound[::-1]])
     first = rng.integers(len(sound) - before - n + 1)
-    sound = sound[first : first + before + n] / np.sqrt(np.mean(sound[first + before : first + before + n] ** 2) + 1e-20)
+    sound = sound[first : first + before + n] / np.sqrt(
+        np.mean(sound[first + before : first + before + n] ** 2) + 1e-20
+    )
     clean = placed(loudest(call.astype(np.float64), n), n, rng)
     clean /= np.sqrt(np.mean(clean**2) + 1e-20)
     return Case(kind, drone, sound[:before], sound[before:], clean.astype(np.float32))
@@ -110,8 +113,8 @@ def with_array(
 ) -> tuple[F32, F32]:  # fmt: skip
     """The case's mixture and call as an array hears them: (mics, n) and (mics, m), call from far away, level.
 
-    The call's delays are exact (by phase). The noise of each microphone is another piece of the same drone, with
-    `coherence` of it (0 to 1, of power) common to all: near rotors are nearly incoherent.
+    The call's delays are exact (by phase). The noise of each microphone is another piece of the same drone,
+    with `coherence` of it (0 to 1, of power) common to all: near rotors are nearly incoherent.
     """
     u = np.array([np.cos(azimuth_rad), np.sin(azimuth_rad), 0.0])
     shifts_s = -(array.positions_m - array.positions_m.mean(axis=0)) @ u / speed_m_s
@@ -125,9 +128,9 @@ def with_array(
     mixtures, clean = [], []
     for mic in range(array.mics):
         at = len(c.before)
-        mix, call = replace(
-            c, before=noises[mic, :at], noise=noises[mic, at:], call=calls[mic]
-        ).mixture(snr_db)
+        mix, call = replace(c, before=noises[mic, :at], noise=noises[mic, at:], call=calls[mic]).mixture(
+            snr_db
+        )
         mixtures.append(mix)
         clean.append(call)
     return np.stack(mixtures), np.stack(clean)

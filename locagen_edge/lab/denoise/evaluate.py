@@ -1,32 +1,32 @@
 """Denoisers judged on recordings and drones that no training heard, beside their peers, in one run.
 
-The measure: output = a clean + residual, a the least-squares gain on the target. SI-SDR = |a clean|^2 / |residual|^2;
-NR = 1 - 10^(-SI-SDRi / 10) is the share of the noise removed at the caller's level, and means nothing without a: a
-method that deletes the caller has a = 0. The paper's own figure is not defined there; `paper` is the share of the
-noise's power that is missing in the residual when a is left alone, and the same of its amplitude.
+The measure: output = a clean + residual, a the least-squares gain on the target. SI-SDR = |a clean|^2 /
+|residual|^2; NR = 1 - 10^(-SI-SDRi / 10) is the share of the noise removed at the caller's level, and means
+nothing without a: a method that deletes the caller has a = 0. The paper's own figure is not defined there;
+`paper` is the share of the noise's power that is missing in the residual when a is left alone, and the same
+of its amplitude.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from locagen_edge.lab.denoise.cases import Case, cases
-from locagen_edge.lab.denoise.peers import Method, peers, spectra_of, wiener, wiener_plain
+from locagen_edge.lab.denoise.peers import Method, peers, wiener, wiener_plain
 from locagen_edge.lab.settings import LabSettings
 from locagen_edge.models import load_network
 from locagen_edge.stages.denoise import CHUNK, MASK_DELAY, WAVE_DELAY, MaskStream, WaveStream
 from locagen_edge.types import F32
 
-SNRS_DB = tuple(float(x) for x in __import__("os").environ["SN"].split()) if "SN" in __import__("os").environ else (-30.0, -25.0, -20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0)
+SNRS_DB = (-30.0, -25.0, -20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0)
 CLASS_SNRS_DB = (-5.0, 0.0, 5.0)
+TUNED = "mask, tuned on the own drone"
 SETTLE = 1024
 """samples at both ends of the call's clip that do not count: filters and delays begin and end there"""
 
@@ -59,7 +59,11 @@ def _si_sdr_db(sound: F32, clean: Any) -> tuple[float, float, float]:
     gain = float(sound @ clean) / power
     residual = float(np.sum((sound - gain * clean) ** 2))
     # an output of nothing at all is no better than the noise alone: -100 dB
-    return 10.0 * math.log10((gain * gain * power + 1e-10 * power) / (residual + 1e-10 * power)), gain, residual
+    return (
+        10.0 * math.log10((gain * gain * power + 1e-10 * power) / (residual + 1e-10 * power)),
+        gain,
+        residual,
+    )
 
 
 # --- methods ------------------------------------------------------------------------------------------
@@ -71,7 +75,8 @@ def wave_method(model: str, s: LabSettings) -> Method:
 
     def run(sound: F32, _: int) -> F32:
         late = WaveStream(network, 1)(_chunks(sound, WAVE_DELAY)[np.newaxis])[0]
-        return late[WAVE_DELAY : WAVE_DELAY + len(sound)]
+        clean: F32 = late[WAVE_DELAY : WAVE_DELAY + len(sound)]
+        return clean
 
     return run
 
@@ -84,7 +89,11 @@ def mask_method(model: str, s: LabSettings) -> Method:
         stream = MaskStream(network, 1)
         out = []
         for first in range(0, len(sound) + MASK_DELAY, CHUNK):
-            piece = _chunks(sound[first : first + CHUNK], 0) if first < len(sound) else np.zeros(CHUNK, np.float32)
+            piece = (
+                _chunks(sound[first : first + CHUNK], 0)
+                if first < len(sound)
+                else np.zeros(CHUNK, np.float32)
+            )
             spectra, mask = stream(piece[np.newaxis])
             out.append(stream.cleaned(spectra, mask)[0])
             if first + CHUNK <= before:
@@ -105,26 +114,36 @@ def _chunks(sound: F32, more: int) -> F32:
 def evaluate(
     s: LabSettings, methods: dict[str, Method], tuned: dict[str, Method], each: int
 ) -> dict[str, Any]:
-    """Scores of all methods on `each` cases per class at SNRS_DB. `tuned`: by drone."""
-    chosen = {**methods, "Wiener, noise before, decision-directed": wiener, "Wiener, noise before": wiener_plain}
+    """Scores of all methods and peers on `each` cases per class at SNRS_DB. `tuned`: by drone."""
     found, missing = peers()
-    chosen |= found
-    scores: list[Score] = []
-    every = list(cases(s, each))
-    for c in tqdm(every, unit="case", desc="evaluate"):
-        own = {"mask, tuned on the own drone": tuned[c.drone]} if c.drone in tuned else {}
-        for snr_db in SNRS_DB:
-            scores += _scores(c, snr_db, {**chosen, **own})
-    names = [*methods, *(["mask, tuned on the own drone"] if tuned else [])]
-    names += [name for name in chosen if name not in names]
+    every = {**methods, "Wiener, noise before": wiener, "Wiener, noise before, plain": wiener_plain, **found}
+    result = run_cases(list(cases(s, each)), every, SNRS_DB, tuned)
     return {
-        "cases": len(every),
-        "drones": sorted({c.drone for c in every}),
-        "tuned_drones": sorted(tuned),
         "missing": missing,
-        "classes": sorted({c.kind for c in every}),
         "unheard": list(s.mixes.unheard),
-        "ours": [name for name in names if name in methods or name.startswith("mask, tuned")],
+        "tuned_drones": sorted(tuned),
+        "ours": [*methods, *([TUNED] if tuned else [])],
+        **result,
+    }
+
+
+def run_cases(
+    chosen: list[Case],
+    methods: dict[str, Method],
+    snrs_db: tuple[float, ...],
+    tuned: dict[str, Method] | None = None,
+) -> dict[str, Any]:
+    """Every method on every case at every SNR, summed up."""
+    scores: list[Score] = []
+    for c in tqdm(chosen, unit="case", desc="evaluate"):
+        own = {TUNED: tuned[c.drone]} if tuned and c.drone in tuned else {}
+        for snr_db in snrs_db:
+            scores += _scores(c, snr_db, {**methods, **own})
+    names = [*methods, *([TUNED] if tuned else [])]
+    return {
+        "cases": len(chosen),
+        "drones": sorted({c.drone for c in chosen}),
+        "classes": sorted({c.kind for c in chosen}),
         "by_snr": {name: _by_snr(scores, name) for name in names},
         "by_class": {name: _by_class(scores, name) for name in names},
         "by_class_and_snr": {name: _by_class_and_snr(scores, name) for name in names},
@@ -192,11 +211,3 @@ def examples(s: LabSettings, method: Method, snr_db: float = 0.0) -> list[dict[s
             "output": method(sound, before), "clean": np.concatenate([np.zeros(before, np.float32), clean]),
         })  # fmt: skip
     return shown
-
-
-def models_in(s: LabSettings, folder: Path) -> LabSettings:
-    """The same settings with the models of another directory."""
-    return dataclasses.replace(s, models=dataclasses.replace(s.models, directory=str(folder)))
-
-
-__all__ = ["evaluate", "examples", "mask_method", "models_in", "score", "spectra_of", "wave_method"]

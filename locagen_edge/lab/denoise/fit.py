@@ -21,7 +21,7 @@ from locagen_edge.errors import DatasetError
 from locagen_edge.lab.denoise.mixes import Batch, Mixer
 from locagen_edge.lab.denoise.sounds import corpus
 from locagen_edge.lab.files import replacing, write
-from locagen_edge.lab.nets.mask import BINS, LOOKAHEAD, MaskNet
+from locagen_edge.lab.nets.mask import LOOKAHEAD, MaskNet
 from locagen_edge.lab.nets.wave import STRIDE, WaveNet
 from locagen_edge.lab.settings import FitSettings, LabSettings, MaskSettings, WaveSettings
 from locagen_edge.stages.denoise import STEP, WINDOW, window
@@ -57,16 +57,17 @@ def si_snr_db(output: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
 
 def gain_of(output: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
     """(batch,): how much of the clean sound the output holds."""
-    return (output * clean).sum(dim=1) / (clean.square().sum(dim=1) + 1e-8)
+    gain: torch.Tensor = (output * clean).sum(dim=1) / (clean.square().sum(dim=1) + 1e-8)
+    return gain
 
 
 def wave_loss(s: WaveSettings) -> Loss:
     """The paper's: 20 % SI-SNR and 80 % mean absolute error.
 
-    SI-SNR counts in dB and the error in units of the clean sound's mean absolute value, so the SI-SNR decides what is
-    heard and the error how loud it is. The other way round, with SI-SNR in units of 10 dB, the network learns to be
-    silent where it is in doubt (a gain of 0.7 on the call at 0 dB, and classes that it deletes). Mixes without a
-    call count with the error alone, in units of the mixture.
+    SI-SNR counts in dB and the error in units of the clean sound's mean absolute value, so the SI-SNR
+    decides what is heard and the error how loud it is. The other way round, with SI-SNR in units of 10 dB,
+    the network learns to be silent where it is in doubt (a gain of 0.7 on the call at 0 dB, and classes
+    that it deletes). Mixes without a call count with the error alone, in units of the mixture.
     """
 
     def loss(net: torch.nn.Module, batch: Batch) -> torch.Tensor:
@@ -90,6 +91,8 @@ def wave_loss(s: WaveSettings) -> Loss:
 def mask_loss(s: MaskSettings) -> Loss:
     """SI-SDR of the resynthesised first microphone, and that the call keeps its loudness.
 
+    How loud counts by the call's share of the mixture: under loud noise it would teach the mask to stay open.
+
     A mix without a call has to become silent: its level against the input counts, in the same unit of 10 dB,
     down to -30 dB.
     """
@@ -107,7 +110,9 @@ def mask_loss(s: MaskSettings) -> Loss:
         clean = batch.call[:, STEP : STEP + output.shape[1]]
         sound = batch.mixture[:, 0, STEP : STEP + output.shape[1]]
         calling = clean.square().sum(dim=1) > 0.0
-        kept = -si_snr_db(output, clean) / 10.0 + s.gain_weight * (1.0 - gain_of(output, clean)).square()
+        share = clean.square().sum(dim=1) / sound.square().sum(dim=1)
+        lost = share.clamp(max=1.0) * (1.0 - gain_of(output, clean)).square()
+        kept = -si_snr_db(output, clean) / 10.0 + s.gain_weight * lost
         silent = torch.log10(output.square().sum(dim=1) / sound.square().sum(dim=1) + 1e-3)
         return torch.where(calling, kept, 0.3 * silent).mean()
 
@@ -155,7 +160,12 @@ def fit(
     if not curve:
         best = _validate(net, loss_of, held)
         weights = {name: value.clone() for name, value in net.state_dict().items()}
-    with tqdm(total=fs.steps, initial=step, unit="step", bar_format="{desc} |{bar}| {n}/{total} {elapsed}<{remaining}") as bar:
+    with tqdm(
+        total=fs.steps,
+        initial=step,
+        unit="step",
+        bar_format="{desc} |{bar}| {n}/{total} {elapsed}<{remaining}",
+    ) as bar:
         while step < fs.steps and time.monotonic() - began < seconds:
             net.train()
             loss = loss_of(net, training.batch(fs.batch))
@@ -224,6 +234,3 @@ def _read(path: Path, kind: str) -> dict[str, Any]:
     if kept.get("kind") != kind:
         raise DatasetError(f"{path}: is of a {kept.get('kind')} network, not of {kind}; use another folder")
     return kept
-
-
-__all__ = ["BINS", "KINDS", "fit", "mixers", "network"]

@@ -1,8 +1,9 @@
 """Mixes on the fly: pools of altered clips, put together anew for every step.
 
-A clip of noise is the drone just before the call, which gives its spectrum, and under it. What is altered: speed
-(blade rate), colour, slow loudness, another drone or background added; of calls speed, colour and an echo. So few
-recordings become many drones, of which none is like the one that will fly, and that is the point.
+A clip of noise is the drone just before the call, which gives its spectrum, and under it. What is altered:
+speed (blade rate), colour, slow loudness, another drone or background added; of calls speed, colour and an
+echo. So few recordings become many drones, of which none is like the one that will fly, and that is the
+point.
 
 SNR: mean square of call over that of noise, over the clip, both high-passed.
 """
@@ -62,7 +63,8 @@ class Mixer:
             self._calls[rng.integers(len(self._calls))] = self._call()
             self._noise[rng.integers(len(self._noise))] = self._drone()
         calls = np.stack([self._calls[k] for k in rng.integers(len(self._calls), size=count)])
-        calls *= 10.0 ** (rng.uniform(*self._s.mixes.snr_db, size=(count, 1)).astype(np.float32) / 20.0)
+        low, high = self._s.mixes.snr_db
+        calls *= 10.0 ** (rng.uniform(low, high, size=(count, 1)).astype(np.float32) / 20.0)
         calls[rng.random(count) < NO_CALL] = 0.0
         chosen = [self._noise[k] for k in rng.integers(len(self._noise), size=count)]
         mixture = calls[:, None] + np.stack([noise for noise, _ in chosen])
@@ -82,7 +84,8 @@ class Mixer:
             sound = placed(sound, n, rng)
             power = np.mean(sound**2)
             if power > 1e-9:
-                return (sound / np.sqrt(power)).astype(np.float32)
+                call: F32 = (sound / np.sqrt(power)).astype(np.float32)
+                return call
 
     def _drone(self) -> tuple[F32, F32]:
         """(MICS, n) of mean square 1, and the power spectrum (MICS, bins) of what was before it."""
@@ -132,13 +135,18 @@ def power_spectra(sound: F64) -> F64:
 def faster(sound: F64, factor: float) -> F64:
     """The same played faster, and as much higher."""
     count = int((len(sound) - 1) / factor)
-    return np.interp(np.arange(count) * factor, np.arange(len(sound)), sound)
+    played: F64 = np.interp(np.arange(count) * factor, np.arange(len(sound)), sound)
+    return played
 
 
 def coloured(sound: F64, swing_db: float, rng: np.random.Generator) -> F64:
-    """Through a smooth filter without delay whose gain wanders by this much (standard deviation) over the band."""
+    """Through a smooth filter without delay whose gain wanders by this much (standard deviation) over the
+    band.
+    """
     size = 1 << (len(sound) - 1).bit_length()
-    gain_db = np.interp(np.linspace(0.0, 1.0, size // 2 + 1), np.linspace(0.0, 1.0, 8), rng.normal(0.0, swing_db, 8))
+    gain_db = np.interp(
+        np.linspace(0.0, 1.0, size // 2 + 1), np.linspace(0.0, 1.0, 8), rng.normal(0.0, swing_db, 8)
+    )
     filtered: F64 = np.fft.irfft(np.fft.rfft(sound, size) * 10.0 ** (gain_db / 20.0), size)[: len(sound)]
     return filtered
 

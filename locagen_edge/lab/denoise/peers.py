@@ -1,7 +1,7 @@
 """What denoisers are compared with: Wiener filters with the same noise reference, and well-known packages.
 
-Every method takes the sound (n,) at 10 kHz, whose first `before` samples are noise alone, and gives (n,) without
-delay. A package that is not installed is named in the report with what would install it.
+Every method takes the sound (n,) at 10 kHz, whose first `before` samples are noise alone, and gives (n,)
+without delay. A package that is not installed is named in the report with what would install it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from locagen_edge.types import F32, Array
 Method = Callable[[F32, int], F32]
 
 FLOOR = 10.0 ** (-25.0 / 10.0)
-"""Least a-priori SNR of the Wiener filter, against musical noise (Cappe, IEEE Trans. SAP 2 (1994) 345-349)."""
+"""Least a-priori SNR of the Wiener filter, against musical noise (Cappe, IEEE Trans. SAP 2 (1994) 345-349).
+"""
 SMOOTHING = 0.9
 
 
@@ -38,8 +39,9 @@ def sound_of(spectra: Array, n: int) -> F32:
 
 
 def wiener(sound: F32, before: int) -> F32:
-    """Wiener's gain with the spectrum of the noise before, decision-directed a-priori SNR (Ephraim & Malah, IEEE
-    Trans. ASSP 32 (1984) 1109-1121)."""
+    """Wiener's gain with the spectrum of the noise before, decision-directed a-priori SNR (Ephraim & Malah,
+    IEEE Trans. ASSP 32 (1984) 1109-1121).
+    """
     spectra = spectra_of(sound)
     noise = (np.abs(spectra[1 : before // STEP]) ** 2).mean(axis=0) + 1e-12
     ratio = np.abs(spectra) ** 2 / noise
@@ -116,8 +118,10 @@ def _rnnoise() -> Method:
 def _at(rate_hz: int, block: int, frames: Callable[[Array], Array]) -> Method:
     """A method on 16-bit blocks (k, block) at its own rate; its delay, up to 60 ms, is taken out."""
 
-    def run(sound: F32, before: int) -> F32:
-        scale = 0.25 / max(float(np.abs(sound).max()), 1e-9)  # loud enough for 16 bits and for voice detectors
+    def run(sound: F32, _: int) -> F32:
+        scale = 0.25 / max(
+            float(np.abs(sound).max()), 1e-9
+        )  # loud enough for 16 bits and for voice detectors
         there = soxr.resample(sound * scale, RATE_HZ, rate_hz)
         there = np.pad(there, (0, -len(there) % block + 4 * block))
         whole = np.ascontiguousarray((there * 32767.0).astype(np.int16).reshape(-1, block))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 import warnings
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 
 from locagen_edge.errors import ModelError
 from locagen_edge.lab.export import install, to_onnx_with_states
+from locagen_edge.lab.files import replacing
 from locagen_edge.lab.nets.mask import BINS, MaskNet
 from locagen_edge.lab.nets.wave import WaveNet
 from locagen_edge.lab.settings import LabSettings
@@ -20,11 +22,17 @@ from locagen_edge.stages.denoise import CHUNK, MASK_DELAY, RATE_HZ, STEP, WAVE_D
 from locagen_edge.types import F32
 
 PARITY = 1e-4
-"""Largest difference between file, by chunks, and trained network, all at once: in a mask of 0 to 1, or in sound
-of about 1."""
+"""Largest difference between file, by chunks, and trained network, all at once: in a mask of 0 to 1, or in
+sound of about 1.
+"""
 CHUNKS = 40
 MICS = 3
 CALLS = 200
+
+
+def models_in(s: LabSettings, directory: Path) -> LabSettings:
+    """The same settings with the models of another directory."""
+    return dataclasses.replace(s, models=dataclasses.replace(s.models, directory=str(directory)))
 
 
 def to_file(net: torch.nn.Module) -> bytes:
@@ -36,7 +44,10 @@ def to_file(net: torch.nn.Module) -> bytes:
             mics = torch.export.Dim("mics", min=1, max=64)
             open_dimensions = ({0: mics}, tuple({0: mics} for _ in states))
             return to_onnx_with_states(
-                net, (torch.rand(MICS, CHUNK), *states), *_names("sound", "clean", len(states)), open_dimensions
+                net,
+                (torch.rand(MICS, CHUNK), *states),
+                *_names("sound", "clean", len(states)),
+                open_dimensions,
             )
         assert isinstance(net, MaskNet)
         states = net.start()
@@ -50,29 +61,41 @@ def _names(given: str, answer: str, states: int) -> tuple[list[str], list[str]]:
 
 
 def publish(name: str, net: torch.nn.Module, directory: Path, s: LabSettings, story: str) -> dict[str, Any]:
-    """Installs the model and checks what was installed. Raises `ModelError` where it does not answer as trained.
+    """Installs the model and checks what was installed. Raises `ModelError` where it does not answer as
+    trained.
 
     `story`: the card's lines on data and figures.
     """
     directory.mkdir(parents=True, exist_ok=True)
     content = to_file(net)
     facts: dict[str, Any] = {
-        "parameters": sum(p.numel() for p in net.parameters()), "bytes": len(content), "parity": 0.0, "call_ms": 0.0,
+        "parameters": sum(p.numel() for p in net.parameters()), "bytes": len(content),
     }  # fmt: skip
     install(name, content, None, "\n", directory)  # without its card: that tells what is measured now
-    network = load_network(name, _at(s, directory))
+    network = load_network(name, models_in(s, directory))
     facts["parity"] = parity(net, network)
     facts["call_ms"] = call_ms(net, network)
     if facts["parity"] > PARITY:
         raise ModelError(f"model {name}: file and trained network differ by {facts['parity']:.2g}")
     install(name, content, None, card(name, net, facts, story), directory)
+    _keep_weights(name, net, directory)
     return facts
 
 
-def _at(s: LabSettings, directory: Path) -> LabSettings:
-    from dataclasses import replace
+def _keep_weights(name: str, net: torch.nn.Module, directory: Path) -> None:
+    """Beside the file, for tuning: an ONNX file does not give them back as they were."""
+    with replacing(directory / f"{name}.npz") as temporary, temporary.open("wb") as file:
+        np.savez(file, **{key: value.numpy() for key, value in net.state_dict().items()})
 
-    return replace(s, models=replace(s.models, directory=str(directory)))
+
+def weights_of(name: str, directory: Path) -> dict[str, torch.Tensor]:
+    """What a model was when it was published. Raises `ModelError` where it cannot be tuned."""
+    path = directory / f"{name}.npz"
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            return {key: torch.from_numpy(kept[key]) for key in kept.files}
+    except (OSError, ValueError) as error:
+        raise ModelError(f"model {name}: {path} with its weights is missing or broken: {error}") from error
 
 
 def parity(net: torch.nn.Module, network: Network) -> float:
@@ -92,9 +115,16 @@ def parity(net: torch.nn.Module, network: Network) -> float:
 def _inputs(net: torch.nn.Module, chunks: int) -> list[F32]:
     rng = np.random.default_rng(1)
     if isinstance(net, WaveNet):
-        return [rng.standard_normal((MICS, chunks * CHUNK)).astype(np.float32)]
-    relative = rng.exponential(1.0, (1, chunks * CHUNK // STEP, BINS)) * 10.0 ** rng.uniform(-1, 2, (1, 1, BINS))
-    return [relative.astype(np.float32), rng.exponential(1.0, (1, BINS)).astype(np.float32)]
+        sound = rng.standard_normal((MICS, chunks * CHUNK)) * np.geomspace(1.0, 1e-5, chunks * CHUNK)
+        sound[1] = 0.0  # a dead microphone
+        return [sound.astype(np.float32)]
+    relative = rng.exponential(1.0, (1, chunks * CHUNK // STEP, BINS)) * 10.0 ** rng.uniform(
+        -1, 2, (1, 1, BINS)
+    )
+    noise = rng.exponential(1.0, (1, BINS))
+    noise[:, ::7] = 0.0
+    relative[:, ::5] = 0.0
+    return [relative.astype(np.float32), noise.astype(np.float32)]
 
 
 def _start(net: torch.nn.Module) -> tuple[torch.Tensor, ...]:
@@ -115,15 +145,19 @@ def call_ms(net: torch.nn.Module, network: Network) -> float:
 
 WHAT = {
     WaveNet: (
-        "The paper's denoiser: a causal 1-D convolutional network from waveform to waveform, one set of weights for "
+        "The paper's denoiser: a causal 1-D convolutional network from waveform to waveform, one set of "
+        "weights for "
         "all microphones",
         "`sound` (mics, 512) float32, high-passed at 80 Hz; states",
-        f"`clean` (mics, 512): the same {WAVE_DELAY} samples ({1e3 * WAVE_DELAY / RATE_HZ:g} ms) earlier; next states",
+        f"`clean` (mics, 512): the same {WAVE_DELAY} samples ({1e3 * WAVE_DELAY / RATE_HZ:g} ms) earlier; "
+        f"next states",
     ),
     MaskNet: (
         "One mask for all microphones, told the spectrum of the noise; it touches no phase",
-        "`relative` (1, 4, 128): power of four spectra (256 samples every 128, root of Hann, bins 1 to 128) over that "
-        "of the noise, mean over microphones; `noise` (1, 128): mean power of the noise, of any level; states",
+        "`relative` (1, 4, 128): power of four spectra (256 samples every 128, root of Hann, bins 1 to "
+        "128) over that "
+        "of the noise, mean over microphones; `noise` (1, 128): mean power of the noise, of any level; "
+        "states",
         "`mask` (1, 4, 128), 0 to 1, of the spectra three earlier: the cleaned sound comes "
         f"{MASK_DELAY} samples ({1e3 * MASK_DELAY / RATE_HZ:g} ms, one hop) late; next states",
     ),
@@ -141,5 +175,22 @@ def card(name: str, net: torch.nn.Module, facts: dict[str, Any], story: str) -> 
 - **Output** {answer}.
 - **Array**: any; 10 kHz.
 - **File**, 512 samples at a time, and trained network, all at once, agree within {facts["parity"]:.0e}.
-- **Time** of one call for {MICS} microphones, one thread, where it was made: {facts["call_ms"]:.2f} ms per 51.2 ms.
+- **Time** of one call for {MICS} microphones, one thread: {facts["call_ms"]:.2f} ms per 51.2 ms, where made.
 {story}"""
+
+
+def story(s: LabSettings, history: list[dict[str, float]]) -> str:
+    """The card's lines on what a network was trained with."""
+    steps = int(history[-1]["step"]) if history else 0
+    best = min((row["validation"] for row in history), default=float("nan"))
+    mixes = s.mixes
+    return (
+        f"- **Trained** for {steps:,} steps on mixes of {mixes.snr_db[0]:g} to {mixes.snr_db[1]:g} dB, "
+        f"{mixes.clip_s:g} s "
+        f"each; best validation loss {best:.3f}. Calls: "
+        f"{'recordings' if mixes.calls else 'none recorded'}, and "
+        f"synthesised; noise: {'recordings' if mixes.noise else 'synthesised rotors'}.\n"
+        f"- **Held out**: noise {', '.join(mixes.held_out) or 'every fifth recording'}; of calls every "
+        f"fifth recording"
+        f"{' and all of ' + ', '.join(mixes.unheard) if mixes.unheard else ''}.\n"
+    )

@@ -155,8 +155,8 @@ def is_held_out(s: LabSettings, name: str, k: int) -> bool:
 
 
 def own_parts(s: LabSettings, sounds: list[F32]) -> tuple[list[F32], list[F32]]:
-    """One drone's recordings, to tune on and to judge by: of four or more recordings every fourth is held back,
-    of fewer the end of each, a quarter of it and at least enough for one mix.
+    """One drone's recordings, to tune on and to judge by: of four or more recordings every fourth is held
+    back, of fewer the end of each, a quarter of it and at least enough for one mix.
 
     Raises `DatasetError` where that leaves nothing to tune on.
     """

@@ -1,9 +1,9 @@
 """The network that serves the bearing: noise relative spectra in, one mask for all microphones out.
 
 Time and frequency are kept apart, so that few weights see much: a band of four bins is described by a short
-vector, every band's vectors run through the same recurrent layer over time, and a dense layer mixes the bands.
-What is learnt of a call in one band holds in the others, and the recurrence is all the memory there is: its
-state goes in and comes out, so a stream cut anywhere gives what the whole file gives.
+vector, every band's vectors run through the same recurrent layer over time, and a dense layer mixes the
+bands. What is learnt of a call in one band holds in the others, and the recurrence is all the memory there
+is: its state goes in and comes out, so a stream cut anywhere gives what the whole file gives.
 
 The mixture comes divided by the tracked noise spectrum (denoise.md's 3 dB), so neither level nor the
 microphones' colour can matter. The answer for a spectrum is given LOOKAHEAD spectra later.
@@ -76,7 +76,7 @@ class MaskNet(torch.nn.Module):
         """Mask (batch, time, BINS) for the spectra LOOKAHEAD earlier, and the next states."""
         batch, time, _ = relative.shape
         level = torch.log10(relative + FLOOR)
-        shape = torch.log10(noise + 1e-20)
+        shape = torch.log10(noise.clamp_min(1e-20))
         shape = (shape - shape.mean(dim=1, keepdim=True)).unsqueeze(1).expand(batch, time, BINS)
         long = torch.cat([states[0], level], dim=1)
         taps = [long[:, k : k + time] for k in range(LOOKAHEAD + 1)]
@@ -95,5 +95,7 @@ class MaskNet(torch.nn.Module):
 def _banded(x: torch.Tensor) -> torch.Tensor:
     """(batch, time, BINS) to (batch, time, BANDS, BAND + 2 AROUND): each band and its neighbours."""
     padded = torch.nn.functional.pad(x, (AROUND, AROUND))
-    parts = [padded[:, :, k : k + BINS].reshape(*x.shape[:2], BANDS, BAND) for k in range(0, 2 * AROUND + 1, BAND)]
+    parts = [
+        padded[:, :, k : k + BINS].reshape(*x.shape[:2], BANDS, BAND) for k in range(0, 2 * AROUND + 1, BAND)
+    ]
     return torch.cat(parts, dim=3)

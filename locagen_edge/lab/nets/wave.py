@@ -1,11 +1,11 @@
 """The paper's denoiser: a causal 1-D convolutional network from waveform to waveform, for one microphone.
 
-One set of weights serves all microphones, so none of them is shifted against another. First and last layer share
-their weights and start as a windowed cosine and sine frame, which reconstructs exactly: random first layers with
-rectifiers learn far too slowly (Luo & Mesgarani, "Conv-TasNet", IEEE/ACM Trans. ASLP 27 (2019), have the same
-encoder, mask and decoder from random weights and hundreds of hours). Between them dilated causal convolutions see
-1.5 s of the past and nothing of the future: a sample comes out once the last piece that holds it has come in,
-STRIDE samples later.
+One set of weights serves all microphones, so none of them is shifted against another. First and last layer
+share their weights and start as a windowed cosine and sine frame, which reconstructs exactly: random first
+layers with rectifiers learn far too slowly (Luo & Mesgarani, "Conv-TasNet", IEEE/ACM Trans. ASLP 27 (2019),
+have the same encoder, mask and decoder from random weights and hundreds of hours). Between them dilated
+causal convolutions see 1.5 s of the past and nothing of the future: a sample comes out once the last piece
+that holds it has come in, STRIDE samples later.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ STRIDE = 64
 KERNEL = 2 * STRIDE
 PAIRS = STRIDE
 """cosines and as many sines"""
+SILENCE = 1e-10
+"""Power under which nothing is told apart. A limit, not a term: the exporter drops terms this small."""
 TAPS = 3
 DILATIONS = (1, 3, 9, 27, 81)
 
@@ -56,7 +58,7 @@ class WaveNet(torch.nn.Module):
 
     def start(self, batch: int = 1) -> States:
         """The states of silence before the first sample."""
-        past = [torch.zeros(batch, (TAPS - 1) * block.dilation, self.width) for block in self.blocks]
+        past = [torch.zeros(batch, (TAPS - 1) * dilation, self.width) for dilation in DILATIONS]
         return (torch.zeros(batch, STRIDE), torch.zeros(batch, STRIDE), *past)
 
     def forward(self, sound: torch.Tensor, *states: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -66,7 +68,9 @@ class WaveNet(torch.nn.Module):
         windows = torch.cat([pieces[:, :-1], pieces[:, 1:]], dim=2)
         heard = windows @ self.frame
         cosine, sine = heard[..., :PAIRS], heard[..., PAIRS:]
-        y = torch.nn.functional.elu(self.enter(0.5 * torch.log10(cosine**2 + sine**2 + 1e-10) + 2.0))
+        y = torch.nn.functional.elu(
+            self.enter(0.5 * torch.log10((cosine**2 + sine**2).clamp_min(SILENCE)) + 2.0)
+        )
         after = [pieces[:, -1]]
         pasts = []
         for block, past in zip(self.blocks, states[2:], strict=True):
