@@ -114,6 +114,11 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 models: $(VENV)/.dev ## trains the models anew
 	$(BIN)/locagen-lab train --settings models/tdoa-mlp.toml --name tdoa-mlp --models models --out build/tdoa-mlp
 
+.PHONY: denoisers
+denoisers: $(VENV)/.dev ## trains the denoisers anew on the recordings in SOUNDS, into build/ (hours)
+	for k in wave mask; do $(BIN)/locagen-lab denoise train $$k --settings models/denoise-$$k.toml \
+	    --calls $(SOUNDS)/signal --noise $(SOUNDS)/noise --out build/denoise-$$k || exit 1; done
+
 .PHONY: paper
 paper: $(VENV)/.dev ## repeats the paper's experiments, into paper-report/ (some minutes)
 	$(BIN)/locagen-lab paper --out paper-report

@@ -34,6 +34,8 @@ def modules_after(statement: str) -> set[str]:
         "import locagen_edge.check",
         "import locagen_edge.stages.mic",
         "from locagen_edge.pipeline import Pipeline; from locagen_edge.settings import from_table; "
+        "Pipeline(from_table({'denoise': {'kind': 'wave'}}))",
+        "from locagen_edge.pipeline import Pipeline; from locagen_edge.settings import from_table; "
         "Pipeline(from_table({'bearing': {'estimator': 'model:tdoa-mlp'}}))",
     ],
 )
@@ -49,7 +51,7 @@ def test_what_is_not_used_is_not_loaded():
     assert not loaded & {"onnxruntime", "sounddevice", "soundfile", "tqdm"}
 
 
-GROUND = {"types", "geometry", "errors", "settings", "kernel", "models", "framing", "resampling"}
+GROUND = {"types", "geometry", "errors", "settings", "kernel", "models", "framing", "resampling", "highpass"}
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
     "stages": GROUND,

@@ -203,7 +203,7 @@ class MaskSettings(FitSettings):
     batch: int = setting(12, "Clips in a step.", unit="clips", least=1, most=4096)
     rate: float = setting(3e-3, "First learning rate of AdamW.", least=1e-7, most=1)
     gain_weight: float = setting(
-        2.0,
+        4.0,
         "Weight of (1 - gain on the call)^2, times the call's share of the mixture, beside the SI-SDR in "
         "units of 10 dB.",
         least=0,

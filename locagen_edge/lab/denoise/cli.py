@@ -164,7 +164,7 @@ def _tune(arguments: argparse.Namespace) -> int:
     s = dataclasses.replace(
         s,
         mask=dataclasses.replace(
-            s.mask, steps=arguments.steps, rate=1e-3, check=max(arguments.steps // 10, 1), patience=1
+            s.mask, steps=arguments.steps, rate=1e-3, check=max(arguments.steps // 6, 1), patience=1
         ),
         mixes=dataclasses.replace(s.mixes, pool=min(s.mixes.pool, 150)),
     )

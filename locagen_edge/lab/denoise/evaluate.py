@@ -25,6 +25,8 @@ from locagen_edge.stages.denoise import CHUNK, MASK_DELAY, WAVE_DELAY, MaskStrea
 from locagen_edge.types import F32
 
 SNRS_DB = (-30.0, -25.0, -20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0)
+HELP = ("crying_baby", "door_knock", "scream", "speech", "whistle")
+"""classes that call for help; music and clapping are judged, but apart"""
 CLASS_SNRS_DB = (-5.0, 0.0, 5.0)
 TUNED = "mask, tuned on the own drone"
 SETTLE = 1024
@@ -145,6 +147,7 @@ def run_cases(
         "drones": sorted({c.drone for c in chosen}),
         "classes": sorted({c.kind for c in chosen}),
         "by_snr": {name: _by_snr(scores, name) for name in names},
+        "help_by_snr": {name: _by_snr([x for x in scores if x.kind in HELP], name) for name in names},
         "by_class": {name: _by_class(scores, name) for name in names},
         "by_class_and_snr": {name: _by_class_and_snr(scores, name) for name in names},
         "by_drone": {name: _by_drone(scores, name) for name in names},

@@ -52,7 +52,8 @@ def si_snr_db(output: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
     gain = gain_of(output, clean).unsqueeze(1)
     rest = output - gain * clean
     power = (gain * clean).square().sum(dim=1)
-    return 10.0 * torch.log10((power + 1e-8) / (rest.square().sum(dim=1) + 1e-8))
+    ratio: torch.Tensor = (power + 1e-8) / (rest.square().sum(dim=1) + 1e-8)
+    return 10.0 * torch.log10(ratio)
 
 
 def gain_of(output: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from locagen_edge.lab.denoise.evaluate import CLASS_SNRS_DB
+from locagen_edge.lab.denoise.evaluate import CLASS_SNRS_DB, HELP
 from locagen_edge.lab.denoise.peers import spectra_of
 from locagen_edge.lab.files import write
 from locagen_edge.lab.plots import draw
@@ -43,7 +43,11 @@ def markdown(result: dict[str, Any]) -> str:
         "",
         "## NR by SNR",
         "",
-        *_table(result["by_snr"], lambda x: f"{x['nr']:.0%}", " dB"),
+        *_table(result["by_snr"], lambda x: f"{x['nr']:.1%}", " dB"),
+        "",
+        f"## NR, and gain, by SNR, of calls for help alone ({', '.join(HELP)})",
+        "",
+        *_table(result["help_by_snr"], lambda x: f"{x['nr']:.1%} ({x['gain']:.2f})", " dB"),
         "",
         "## In the paper's terms",
         "",
