@@ -52,8 +52,8 @@ def si_snr_db(output: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
     gain = gain_of(output, clean).unsqueeze(1)
     rest = output - gain * clean
     power = (gain * clean).square().sum(dim=1)
-    ratio: torch.Tensor = (power + 1e-8) / (rest.square().sum(dim=1) + 1e-8)
-    return 10.0 * torch.log10(ratio)
+    ratio_db: torch.Tensor = 10.0 * torch.log10((power + 1e-8) / (rest.square().sum(dim=1) + 1e-8))
+    return ratio_db
 
 
 def gain_of(output: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
@@ -84,7 +84,8 @@ def wave_loss(s: WaveSettings) -> Loss:
         unit = torch.where(calling, clean.abs().mean(dim=1), mixture.abs().mean(dim=1))
         error = (output - clean).abs().mean(dim=1) / unit
         snr = torch.where(calling, si_snr_db(output, clean), torch.zeros_like(unit))
-        return (-s.si_snr_share * snr + (1.0 - s.si_snr_share) * error).mean()
+        total: torch.Tensor = (-s.si_snr_share * snr + (1.0 - s.si_snr_share) * error).mean()
+        return total
 
     return loss
 
