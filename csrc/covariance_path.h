@@ -16,7 +16,8 @@ STEP void to_planes(const steer *s)
     for (int m = 0; m < s->mics; m++) {
         const float *re = s->spectrum.bins_re[m / 4] + 4 * s->spectrum.first_bin + m % 4;
         const float *im = s->spectrum.bins_im[m / 4] + 4 * s->spectrum.first_bin + m % 4;
-        float *to_re = s->bins_re + m * (long)s->stride, *to_im = s->bins_im + m * (long)s->stride;
+        long at = (s->slot * (long)s->mics + m) * s->stride;
+        float *to_re = s->bins_re + at, *to_im = s->bins_im + at;
         for (long k = 0; k < s->bins; k++)
             to_re[k] = re[4 * k], to_im[k] = im[4 * k];
     }
@@ -24,20 +25,21 @@ STEP void to_planes(const steer *s)
 
 /* R <- keep R + share x x^H, of the microphones in the frame; the others' numbers fade as if they were
  * silent. */
-STEP void add_frame(const steer *s, float keep, float share, float *matrix)
+STEP void add_frame(const steer *s, int32_t slot, float keep, float share, float *matrix)
 {
-    long stride = s->stride;
+    long stride = s->stride, frame = slot * (long)s->mics * stride;
+    int mics = s->frame_mics[slot];
     float *pair = matrix + s->mics * stride;
     for (int i = 0; i < s->mics; i++) {
-        const float *ir = s->bins_re + i * stride, *ii = s->bins_im + i * stride;
-        float own = s->frame_mics >> i & 1 ? share : 0.0f;
+        const float *ir = s->bins_re + frame + i * stride, *ii = s->bins_im + frame + i * stride;
+        float own = mics >> i & 1 ? share : 0.0f;
         for (long k = 0; k < stride; k += WIDTH) {
             vec re = load(ir + k), im = load(ii + k);
             store(matrix + i * stride + k, keep * load(matrix + i * stride + k) + own * (re * re + im * im));
         }
         for (int j = i + 1; j < s->mics; j++, pair += 2 * stride) {
-            const float *jr = s->bins_re + j * stride, *ji = s->bins_im + j * stride;
-            float both_of = s->frame_mics >> j & 1 ? own : 0.0f;
+            const float *jr = s->bins_re + frame + j * stride, *ji = s->bins_im + frame + j * stride;
+            float both_of = mics >> j & 1 ? own : 0.0f;
             for (long k = 0; k < stride; k += WIDTH) {
                 vec xr = load(ir + k), xi = load(ii + k), yr = load(jr + k), yi = load(ji + k);
                 store(pair + k, keep * load(pair + k) + both_of * (xr * yr + xi * yi));
@@ -153,6 +155,67 @@ INLINE void null_source(const int M, const steer *s, int source, long k, cvec g[
         }
 }
 
+/* Of every plane of R_n the mean over smear_half bins each side, as running sums. */
+STEP void smear(const steer *s)
+{
+    long half = s->smear_half, bins = s->bins;
+    for (long plane = 0; plane < s->mics * s->mics; plane++) {
+        const float *from = s->noise + plane * s->stride;
+        float *to = s->smeared + plane * s->stride;
+        double sum = 0;
+        for (long k = 0; k < half && k < bins; k++)
+            sum += (double)from[k];
+        for (long k = 0; k < bins; k++) {
+            long first = k - half > 0 ? k - half : 0, last = k + half < bins - 1 ? k + half : bins - 1;
+            if (k + half < bins)
+                sum += (double)from[k + half];
+            if (k > half)
+                sum -= (double)from[k - half - 1];
+            to[k] = (float)(sum / (double)(last - first + 1));
+        }
+    }
+}
+
+/* G = R_n^-1 over the level of R_n, and 1 / level, for all searches until R_n changes. */
+INLINE void invert_bins(const int M, const steer *s, const locagen_whitening *how)
+{
+    long stride = s->stride;
+    float count = (float)__builtin_popcount((unsigned)how->mics);
+    int smeared = s->smear > 0.0f && how->white == 0.0f;
+    if (smeared)
+        smear(s);
+    for (long k = 0; k < stride; k += WIDTH) {
+        cvec g[MOST_MICS][MOST_MICS], around[MOST_MICS][MOST_MICS];
+        fetch_matrix(M, s, s->noise, how->noise_scale, how->mics, k, g);
+        if (smeared) {
+            fetch_matrix(M, s, s->smeared, s->smear * how->noise_scale, how->mics, k, around);
+            for (int i = 0; i < M; i++)
+                for (int j = 0; j < M; j++)
+                    g[i][j].re += around[i][j].re, g[i][j].im += around[i][j].im;
+        }
+        vec level = all(0.0f);
+        for (int i = 0; i < M; i++)
+            level += g[i][i].re;
+        level = how->white > 0.0f ? all(how->white) : level * (1.0f / count) + s->floor;
+        vec rate = 1.0f / level;
+        vec added = how->white > 0.0f ? all(1.0f) : s->loading + s->floor * rate;
+        float noise = how->white > 0.0f ? 0.0f : 1.0f;
+        for (int i = 0; i < M; i++)
+            for (int j = 0; j < M; j++)
+                g[i][j].re *= rate * noise, g[i][j].im *= rate * noise;
+        for (int i = 0; i < M; i++)
+            g[i][i].re = how->mics >> i & 1 ? g[i][i].re + added : all(1.0f);
+        invert(M, 0.5f * s->loading, g);
+        float *pair = s->inverse + M * stride + k;
+        for (int i = 0; i < M; i++) {
+            store(s->inverse + i * stride + k, g[i][i].re);
+            for (int j = i + 1; j < M; j++, pair += 2 * stride)
+                store(pair, g[i][j].re), store(pair + stride, g[i][j].im);
+        }
+        store(s->rate + k, rate);
+    }
+}
+
 /* Fills the fine response: numerator and denominator of q, both over the mean diagonal of G, so that
  * neighbouring bins may be added up. */
 INLINE void whiten_bins(const int M, const steer *s, const locagen_whitening *how)
@@ -162,26 +225,12 @@ INLINE void whiten_bins(const int M, const steer *s, const locagen_whitening *ho
     float count = (float)__builtin_popcount((unsigned)how->mics);
     for (long k = 0; k < stride; k += WIDTH) {
         cvec g[MOST_MICS][MOST_MICS], x[MOST_MICS][MOST_MICS], h[MOST_MICS][MOST_MICS];
-        fetch_matrix(M, s, s->noise, how->noise_scale, how->mics, k, g);
-        fetch_matrix(M, s, s->signal, how->signal_scale, how->mics, k, x);
-        vec level = all(0.0f);
+        fetch_matrix(M, s, s->inverse, 1.0f, how->mics, k, g);
+        fetch_matrix(M, s, how->span->signal, how->signal_scale, how->mics, k, x);
+        vec rate = load(s->rate + k);
         for (int i = 0; i < M; i++)
-            level += g[i][i].re;
-        level = how->white > 0.0f ? all(how->white) : level * (1.0f / count) + s->floor;
-        vec rate = 1.0f / level;
-        vec added = how->white > 0.0f ? all(1.0f) : s->loading + s->floor * rate;
-        float noise = how->white > 0.0f ? 0.0f : 1.0f;
-        for (int i = 0; i < M; i++)
-            for (int j = 0; j < M; j++) {
-                g[i][j].re *= rate * noise, g[i][j].im *= rate * noise;
+            for (int j = 0; j < M; j++)
                 x[i][j].re *= rate, x[i][j].im *= rate;
-            }
-        for (int i = 0; i < M; i++)
-            g[i][i].re = how->mics >> i & 1 ? g[i][i].re + added : all(1.0f);
-        invert(M, 0.5f * s->loading, g);
-        for (int i = 0; i < M; i++)
-            if (!(how->mics >> i & 1))
-                g[i][i].re = all(0.0f);
         for (int source = 0; source < how->nulls; source++)
             null_source(M, s, source, k, g);
 
@@ -193,9 +242,9 @@ INLINE void whiten_bins(const int M, const steer *s, const locagen_whitening *ho
                     h[i][j].re += t.re, h[i][j].im += t.im;
                 }
             }
-        vec trace = all(0.0f);
+        vec trace = all(0.0f), power = all(0.0f);
         for (int i = 0; i < M; i++)
-            trace += g[i][i].re;
+            trace += g[i][i].re, power += h[i][i].re;
         vec unit = count / larger(trace, all(1e-6f));
         vec sum = all(0.0f);
         float *pair = out + 2 * stride + k;
@@ -216,22 +265,27 @@ INLINE void whiten_bins(const int M, const steer *s, const locagen_whitening *ho
         }
         store(out + k, unit * sum);
         store(out + stride + k, unit * trace);
+        store(pair, power * (1.0f / count));
     }
 }
 
-#define WHITEN(M)                                                                                            \
-    STEP void whiten_##M(const steer *s, const locagen_whitening *how) { whiten_bins(M, s, how); }
-WHITEN(2)
-WHITEN(3)
-WHITEN(4)
+#define FOR_MICS(name, M)                                                                                    \
+    STEP void name##_##M(const steer *s, const locagen_whitening *how) { name##_bins(M, s, how); }
+FOR_MICS(invert, 2)
+FOR_MICS(invert, 3)
+FOR_MICS(invert, 4)
+STEP void invert_many(const steer *s, const locagen_whitening *how) { invert_bins(s->mics, s, how); }
+FOR_MICS(whiten, 2)
+FOR_MICS(whiten, 3)
+FOR_MICS(whiten, 4)
 STEP void whiten_many(const steer *s, const locagen_whitening *how) { whiten_bins(s->mics, s, how); }
 
 /* Neighbouring bins of the fine response, added up. */
 STEP void thin(const steer *s)
 {
     const locagen_response *fine = &s->fine, *coarse = &s->coarse;
-    long step = (long)coarse->weight;
-    for (long plane = 0; plane < 2 + 4 * s->pairs; plane++) {
+    long step = coarse->thinning;
+    for (long plane = 0; plane < 3 + 4 * s->pairs; plane++) {
         const float *from = fine->planes + plane * fine->stride;
         float *to = coarse->planes + plane * coarse->stride;
         for (long k = 0; k < coarse->bins; k++) {
@@ -241,6 +295,11 @@ STEP void thin(const steer *s)
             to[k] = sum;
         }
     }
+}
+
+static void invert_band(const steer *s, const locagen_whitening *how)
+{
+    (s->mics == 2 ? invert_2 : s->mics == 3 ? invert_3 : s->mics == 4 ? invert_4 : invert_many)(s, how);
 }
 
 static void whiten_band(const steer *s, const locagen_whitening *how)

@@ -15,7 +15,9 @@ int locagen_frame_avx2(const state *s, const float *in, float *correlation, floa
     return frame_path(s, in, correlation, power);
 }
 
-const locagen_steer_paths locagen_steer_avx2 = {listen, add_frame, whiten_band, score_groups};
+const locagen_steer_paths locagen_steer_avx2 = {
+    WIDTH, listen, add_frame, watch, invert_band, whiten_band, score_groups,
+};
 #if defined(__clang__)
 #pragma clang attribute pop
 #endif

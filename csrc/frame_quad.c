@@ -8,4 +8,4 @@ int locagen_frame_quad(const state *s, const float *in, float *correlation, floa
     return frame_path(s, in, correlation, power);
 }
 
-const locagen_steer_paths locagen_steer_quad = {listen, add_frame, whiten_band, score_groups};
+const locagen_steer_paths locagen_steer_quad = {WIDTH, listen, add_frame, watch, invert_band, whiten_band, score_groups};

@@ -254,6 +254,14 @@ const char *locagen_strerror(int code)
         return "grid: must have 8 to 720 azimuths and 2 to 180 elevations";
     case LOCAGEN_E_SHARE:
         return "share: must be 0 to 1";
+    case LOCAGEN_E_SPAN:
+        return "spans: 1 to 4 of them, counted from 0";
+    case LOCAGEN_E_LAG:
+        return "lag: 0 to 64 hops are needed";
+    case LOCAGEN_E_WEIGHT:
+        return "weights: 0 to 1 are needed";
+    case LOCAGEN_E_LEAST:
+        return "least score: 0 or more is needed";
     case LOCAGEN_E_COUNT:
         return "sources: at least one must be asked for";
     default:

@@ -59,11 +59,15 @@ enum locagen_error {
     LOCAGEN_E_HOP = -8,     /* hop: 0, or frame / 8 and more */
     LOCAGEN_E_TAPER = -9,   /* taper: 0 to 1 */
     LOCAGEN_E_SMOOTH = -10, /* smooth_bins: 0 to 64 */
-    LOCAGEN_E_NOISE = -11,  /* loading 1e-5 to 1, floor 1e-15 to 1 */
+    LOCAGEN_E_NOISE = -11,  /* loading 1e-5 to 1, floor 1e-15 to 1, smear 0 to 1 */
     LOCAGEN_E_ARRAY = -12,  /* positions within 10 m, two of them 1 mm apart; speed of sound 100 to 2000 m/s */
     LOCAGEN_E_GRID = -13,   /* grid: azimuths 8 to 720, elevations 2 to 180 */
     LOCAGEN_E_SHARE = -14,  /* share: 0 to 1 */
-    LOCAGEN_E_COUNT = -15   /* sources: at least 1 */
+    LOCAGEN_E_COUNT = -15,  /* sources: at least 1 */
+    LOCAGEN_E_SPAN = -16,   /* spans: 1 to 4, counted from 0 */
+    LOCAGEN_E_LAG = -17,    /* lag: 0 to 64 hops */
+    LOCAGEN_E_WEIGHT = -18, /* weights: 0 to 1 */
+    LOCAGEN_E_LEAST = -19   /* least score: 0 or more */
 };
 
 typedef struct {
@@ -97,6 +101,8 @@ typedef struct {
     int32_t mics;
     int32_t frame;         /* samples per microphone and frame */
     int32_t hop;           /* samples from frame to frame, 0: no overlap; only to count what frames are worth */
+    int32_t spans;         /* averages R_x side by side, each with a memory of its own: 1 to 4 */
+    int32_t lag;           /* learn takes the frame of so many listens ago: a call is known only after a while */
     int32_t smooth_bins;   /* bins each side over which q is averaged: the source's spectrum is smooth there */
     int32_t azimuths;      /* coarse grid: azimuths of the full circle, the first at 0 */
     int32_t elevations;    /* rows, at half steps: over the lower half for a flat array, else the whole sphere */
@@ -105,6 +111,7 @@ typedef struct {
     float band_high_hz;
     float taper;           /* share of the window that is tapered (Tukey's): 0 rectangle, 1 Hann */
     float loading;         /* added to R_n's diagonal, as a share of its mean diagonal */
+    float smear;           /* share of R_n, averaged over 100 Hz each side, that is added to it: tones wander */
     float floor;           /* the same as power of one bin, mean square of full scale: silence stays finite */
     float speed_m_s;       /* of sound */
     float positions_m[24]; /* FRD, x y z of each microphone in turn; what follows the last one is not read */
@@ -112,6 +119,9 @@ typedef struct {
 
 /* score: log of the likelihood ratio against "noise only", for a further source against "noise and the
  * sources before it". Noise alone gives some tens at 451 bins.
+ *
+ * contrast: the same for the strongest source against "all of the noise has become louder": below 0 where
+ * rotors rise, wind or a touch of the microphones is the better reason.
  *
  * snr: per microphone, power ratio: (mean q - 1) / microphones, 0 or more. Under coloured noise: that of white
  * noise in which the source would be as well seen.
@@ -124,6 +134,7 @@ typedef struct {
     float azimuth_rad;   /* -pi to pi */
     float elevation_rad; /* positive up; of two images that a flat array cannot tell apart the lower one */
     float score;
+    float contrast;
     float snr;
     float information[3];
 } locagen_source;
@@ -146,32 +157,43 @@ int locagen_steer_reset(locagen_steer *state);
  * one that was left out of more than a tenth of R_n or R_x is left out of the search. */
 int locagen_steer_listen(locagen_steer *state, const float *in, float *power);
 
-/* R_n <- (1 - share) R_n + share x x^H with the bins of the last frame, while nothing calls. The start is
- * corrected for: after the first call R_n is x x^H, whatever the share. */
+/* R_n <- (1 - share) R_n + share x x^H with the bins of the frame `lag` before the last, while nothing calls;
+ * nothing where so many have not been. The start is corrected for: after the first call R_n is x x^H, whatever
+ * the share. */
 int locagen_steer_learn(locagen_steer *state, float share);
 
-/* The same for R_x. share 1: this frame alone. */
-int locagen_steer_hear(locagen_steer *state, float share);
+/* The same for the R_x of one span, with the last frame. share 1: this frame alone. */
+int locagen_steer_hear(locagen_steer *state, int32_t span, float share);
 
 /* Looks for up to `most` sources in R_x, strongest first; each is nulled (in whitened space) before the next
  * is looked for, and at last the directions of those that are clearly more than noise are refined, each with
  * the others nulled. Returns how many `out` holds: none before hear, in silence or with less than two
- * microphones; at most one less than there are microphones. A state that never learnt takes the noise for
+ * microphones; at most one less than there are microphones; none that scores `least` or less, and where
+ * nothing does on the grid nothing is refined, which saves half of the time. A state that never learnt takes the noise for
  * white, and its level from what R_x holds across its best direction (M - 1 of M dimensions). */
-int locagen_steer_search(locagen_steer *state, int32_t most, locagen_source *out);
+int locagen_steer_search(locagen_steer *state, int32_t span, int32_t most, float least, locagen_source *out);
+
+/* Keeps in mind how far q strayed from 1 in the last search, in each direction of the grid and each part of
+ * the band; while nothing calls. From then on T is there so much smaller: 1 / (E (q - 1)^2 * bins averaged), which
+ * is T itself where the noise keeps still. So a score means the same under rotors that hum and under rotors
+ * that hunt: a constant false-alarm rate. */
+int locagen_steer_watch(locagen_steer *state, int32_t span, float share);
+
+/* Weights 0 to 1 of all bins, for the searches to come: each bin counts as so many looks less. */
+int locagen_steer_weigh(locagen_steer *state, const float *weight);
 
 /* Bins in the band, and the number of the first. */
 int locagen_steer_bin_count(const locagen_steer *state);
 int locagen_steer_first_bin(const locagen_steer *state);
 
 /* For tests and other stages. bins: complex (re, im) [mics][bins], |x|^2 the bin's power. noise: complex
- * [bins][mics][mics], R_n without loading and floor, zeros where nothing was learnt. map: scores [elevations]
- * [azimuths] on the coarse grid, for which bins are added up by the few (see steering.c), with its axes in
- * radians; it takes about as long as a search. */
+ * [bins][mics][mics], R_n without smear, loading and floor, zeros where nothing was learnt. map: scores
+ * [elevations][azimuths] on the coarse grid, for which bins are added up by the few (see steering.c), of the
+ * span's last search, with its axes in radians. */
 int locagen_steer_bins(const locagen_steer *state, float *bins);
 int locagen_steer_noise(const locagen_steer *state, float *noise);
 int locagen_steer_axes(const locagen_steer *state, float *elevation, float *azimuth);
-int locagen_steer_map(locagen_steer *state, float *map);
+int locagen_steer_map(const locagen_steer *state, int32_t span, float *map);
 
 /* A sentence for an error code, in static memory. */
 const char *locagen_strerror(int code);

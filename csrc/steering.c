@@ -29,11 +29,17 @@ static const double WIDTHS[] = {0.6, 0.4, 0.2, 0.2};
 static const double LOBE = 3.0;  /* radians of phase from a lobe's top to beyond its foot */
 static const float CLOSE = 0.9f; /* the grid costs a lobe less than a tenth of its score */
 
+static const double SMEAR_HZ = 100;      /* each side: what a rotor's tones wander in some seconds at 4 kHz */
+static const double PRIOR_LOOKS = 4;     /* worth of theory against what q has been: independent values of it */
 static const double LOST = 0.1;          /* a microphone missing from more of R does not count */
 static const double SILENT = 1e-5;       /* power under the loudest one's: -50 dB */
 static const float LEAST_DENOMINATOR = 1e-6f; /* of microphones: loading keeps the true ones above it */
 static const float LEAST_AFTER_NULL = 0.05f;  /* nearer to a nulled source nothing can be told */
 static const double WHITE_SHARE = 1e-7;  /* of the signal, the least noise that is estimated: float's own */
+
+static const double WATCH_SHARE = 1.0 / 300; /* the usual share of one hop in the spread: 15 s of hops */
+
+static const locagen_spread PLAIN; /* as theory says */
 
 enum { MOST_THINNING = 8, LEAST_COARSE = 8, MOST_LOBES = 4 };
 
@@ -45,6 +51,12 @@ static steer *state_of(const void *memory)
 static int within(double x, double low, double high)
 {
     return x >= low && x <= high;
+}
+
+/* Groups of directions in the grid. */
+static int groups_of(const steer *s)
+{
+    return (s->azimuths * s->elevations + DIRECTIONS - 1) / DIRECTIONS;
 }
 
 static double dot(const double a[3], const double b[3])
@@ -94,7 +106,11 @@ static int check(const locagen_steer_config *c)
         return LOCAGEN_E_TAPER;
     if (c->smooth_bins < 0 || c->smooth_bins > 64)
         return LOCAGEN_E_SMOOTH;
-    if (!within(c->loading, 0.999e-5, 1) || !within(c->floor, 0.999e-15, 1))
+    if (c->spans < 1 || c->spans > MOST_SPANS)
+        return LOCAGEN_E_SPAN;
+    if (c->lag < 0 || c->lag > MOST_LAG)
+        return LOCAGEN_E_LAG;
+    if (!within(c->loading, 0.999e-5, 1) || !within(c->floor, 0.999e-15, 1) || !within(c->smear, 0, 1))
         return LOCAGEN_E_NOISE;
     for (int n = 0; n < 3 * c->mics; n++)
         if (!within(c->positions_m[n], -10, 10))
@@ -139,15 +155,16 @@ static void find_plane(steer *s, const locagen_steer_config *c)
         s->flat &= fabs(dot(arm[m], z)) <= 1e-3;
 }
 
-static void lay_out_response(locagen_response *r, const steer *s, int bins, int half, int weight,
+static void lay_out_response(locagen_response *r, const steer *s, int bins, int half, int thinning,
                              locagen_arena *a)
 {
     r->bins = bins;
     r->stride = (bins + BIN_BLOCK - 1) / BIN_BLOCK * BIN_BLOCK;
     r->half = half < bins - 1 ? half : bins - 1;
-    r->weight = (float)weight;
-    r->planes = locagen_take(a, (size_t)(2 + 4 * s->pairs) * (size_t)r->stride);
+    r->thinning = thinning;
+    r->planes = locagen_take(a, (size_t)(3 + 4 * s->pairs) * (size_t)r->stride);
     r->share = locagen_take(a, (size_t)bins);
+    r->looks = locagen_take(a, (size_t)bins);
 }
 
 /* Sizes and places; with a null base only the arena's count is meant. */
@@ -161,6 +178,8 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
     s->stride = (s->bins + BIN_BLOCK - 1) / BIN_BLOCK * BIN_BLOCK;
     s->loading = c->loading, s->floor = c->floor;
     s->azimuths = c->azimuths, s->elevations = c->elevations;
+    s->spans = c->spans, s->lag = c->lag;
+    s->smear = c->smear, s->smear_half = (int32_t)(SMEAR_HZ * c->frame / c->rate_hz);
     find_plane(s, c);
     s->whole_sphere = !s->flat;
 
@@ -183,19 +202,28 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
         thinning *= 2;
 
     size_t planes = (size_t)(s->mics * s->mics) * (size_t)s->stride, mics = (size_t)s->mics;
-    s->bins_re = locagen_take(a, mics * (size_t)s->stride);
-    s->bins_im = locagen_take(a, mics * (size_t)s->stride);
-    s->noise = locagen_take(a, planes), s->signal = locagen_take(a, planes);
+    s->bins_re = locagen_take(a, ((size_t)s->lag + 1) * mics * (size_t)s->stride);
+    s->bins_im = locagen_take(a, ((size_t)s->lag + 1) * mics * (size_t)s->stride);
+    s->noise = locagen_take(a, planes), s->smeared = locagen_take(a, planes);
+    s->inverse = locagen_take(a, planes), s->rate = locagen_take(a, (size_t)s->stride);
+    s->mask = locagen_take(a, (size_t)s->stride);
     lay_out_response(&s->fine, s, s->bins, c->smooth_bins, 1, a);
     /* As many bins in the average: 2 half + 1 blocks nearest to 2 smooth_bins + 1 bins. */
     double blocks = (2 * c->smooth_bins + 1) / (double)thinning;
     lay_out_response(&s->coarse, s, s->bins / thinning, (int)floor((blocks - 1) / 2 + 0.5), thinning, a);
     s->nulls = locagen_take(a, 2 * (mics - 1) * mics * (size_t)s->stride);
-    size_t groups = ((size_t)(s->azimuths * s->elevations) + DIRECTIONS - 1) / DIRECTIONS;
+    size_t groups = (size_t)groups_of(s);
     s->grid = locagen_take(a, groups * (mics - 1) * 4 * DIRECTIONS);
     s->aim = locagen_take(a, (mics - 1) * 4 * DIRECTIONS);
     s->scores = locagen_take(a, 2 * groups * DIRECTIONS);
     s->q = locagen_take(a, (size_t)s->bins * DIRECTIONS);
+    for (int n = 0; n < s->spans; n++) {
+        locagen_span *span = &s->span[n];
+        span->signal = locagen_take(a, planes);
+        span->scores = locagen_take(a, groups * DIRECTIONS);
+        span->over = locagen_take(a, groups * DIRECTIONS * (size_t)s->coarse.bins);
+        span->spread = locagen_take(a, groups * DIRECTIONS * (size_t)s->coarse.bins);
+    }
     s->grid_u = (double *)(void *)locagen_take(a, 2 * 3 * groups * DIRECTIONS);
 }
 
@@ -233,8 +261,8 @@ static double grid_azimuth(const steer *s, int column)
 static void fill_grid(steer *s)
 {
     int count = s->azimuths * s->elevations;
-    double thinning = (double)s->coarse.weight;
-    for (int n = 0; n < (count + DIRECTIONS - 1) / DIRECTIONS * DIRECTIONS; n++) {
+    double thinning = s->coarse.thinning;
+    for (int n = 0; n < groups_of(s) * DIRECTIONS; n++) {
         int at = n < count ? n : count - 1;
         double elevation = grid_elevation(s, at / s->azimuths), azimuth = grid_azimuth(s, at % s->azimuths);
         double *u = s->grid_u + 3 * n;
@@ -291,6 +319,8 @@ int locagen_steer_init(locagen_steer *memory, const locagen_steer_config *config
     fill_response(&s->coarse);
     fill_grid(s);
     count_looks(s, config);
+    for (int k = 0; k < s->bins; k++)
+        s->mask[k] = 1;
 
     s->paths = &locagen_steer_quad;
 #if defined(__x86_64__)
@@ -306,12 +336,22 @@ int locagen_steer_reset(locagen_steer *memory)
         return LOCAGEN_E_NULL;
     steer *s = state_of(memory);
     size_t row = (size_t)s->stride * sizeof(float), mics = (size_t)s->mics;
-    memset(s->bins_re, 0, mics * row), memset(s->bins_im, 0, mics * row);
-    memset(s->noise, 0, mics * mics * row), memset(s->signal, 0, mics * mics * row);
-    memset(s->lost_noise, 0, sizeof s->lost_noise), memset(s->lost_signal, 0, sizeof s->lost_signal);
-    memset(s->heard_weights, 0, sizeof s->heard_weights);
-    s->learnt = s->heard = s->heard_variance = 0;
-    s->frame_mics = 0;
+    size_t groups = (size_t)groups_of(s) * DIRECTIONS * sizeof(float), blocks = groups * (size_t)s->coarse.bins;
+    memset(s->bins_re, 0, ((size_t)s->lag + 1) * mics * row);
+    memset(s->bins_im, 0, ((size_t)s->lag + 1) * mics * row);
+    memset(s->noise, 0, mics * mics * row);
+    memset(s->lost_noise, 0, sizeof s->lost_noise);
+    memset(s->learnt_weights, 0, sizeof s->learnt_weights);
+    memset(s->frame_mics, 0, sizeof s->frame_mics);
+    s->learnt = s->learnt_variance = 0;
+    s->slot = s->listened = s->inverse_mics = 0;
+    for (int n = 0; n < s->spans; n++) {
+        locagen_span *span = &s->span[n];
+        memset(span->signal, 0, mics * mics * row);
+        memset(span->scores, 0, groups), memset(span->over, 0, blocks), memset(span->spread, 0, blocks);
+        memset(span->lost, 0, sizeof span->lost), memset(span->heard_weights, 0, sizeof span->heard_weights);
+        span->heard = span->heard_variance = span->watched = 0;
+    }
     return LOCAGEN_OK;
 }
 
@@ -320,23 +360,35 @@ int locagen_steer_listen(locagen_steer *memory, const float *in, float *power)
     if (memory == NULL || in == NULL || power == NULL)
         return LOCAGEN_E_NULL;
     steer *s = state_of(memory);
-    int bad = s->paths->listen(s, in, power);
+    s->slot = (s->slot + 1) % (s->lag + 1);
+    s->listened = s->listened <= s->lag ? s->listened + 1 : s->listened;
+    int bad = s->paths->listen(s, in, power), mics = 0;
     float loudest = 0; /* not fmax of doubles: gcc 12 for aarch64 breaks down over vectors of that */
     for (int m = 0; m < s->mics; m++)
         loudest = power[m] > loudest ? power[m] : loudest;
-    s->frame_mics = 0;
     for (int m = 0; m < s->mics; m++)
         if (!(bad >> m & 1) && power[m] >= SILENT * loudest)
-            s->frame_mics |= 1 << m;
+            mics |= 1 << m;
+    s->frame_mics[s->slot] = mics;
     return bad;
 }
 
-static double add(const steer *s, double weight, float share, float *lost, float *matrix)
+/* An average of frames gets one more: its matrix, the weight that lacks each microphone, the sum of weights
+ * and, for overlapping frames depend on each other, the variance of such a sum. */
+static void add(const steer *s, int slot, float share, float *matrix, float *lost, double *weight,
+                double *variance, double weights[8])
 {
-    s->paths->add(s, 1.0f - share, share, matrix);
+    s->paths->add(s, slot, 1.0f - share, share, matrix);
     for (int m = 0; m < s->mics; m++)
-        lost[m] = (1.0f - share) * lost[m] + (s->frame_mics >> m & 1 ? 0.0f : share);
-    return (1.0f - share) * weight + share;
+        lost[m] = (1.0f - share) * lost[m] + (s->frame_mics[slot] >> m & 1 ? 0.0f : share);
+    double keep = 1.0f - share, fresh = (double)share, with_old = 0;
+    *weight = keep * *weight + fresh;
+    for (int hop = 0; hop < s->hops; hop++)
+        with_old += s->overlap[hop] * keep * weights[hop];
+    *variance = keep * keep * *variance + fresh * fresh + 2 * fresh * with_old;
+    for (int hop = 7; hop > 0; hop--)
+        weights[hop] = keep * weights[hop - 1];
+    weights[0] = fresh;
 }
 
 int locagen_steer_learn(locagen_steer *memory, float share)
@@ -346,46 +398,147 @@ int locagen_steer_learn(locagen_steer *memory, float share)
     if (!within(share, 0, 1))
         return LOCAGEN_E_SHARE;
     steer *s = state_of(memory);
-    s->learnt = add(s, s->learnt, share, s->lost_noise, s->noise);
+    if (s->listened <= s->lag)
+        return LOCAGEN_OK;
+    int oldest = (s->slot + 1) % (s->lag + 1);
+    add(s, oldest, share, s->noise, s->lost_noise, &s->learnt, &s->learnt_variance, s->learnt_weights);
+    s->inverse_mics = 0;
     return LOCAGEN_OK;
 }
 
-int locagen_steer_hear(locagen_steer *memory, float share)
+static locagen_span *span_of(steer *s, int32_t span)
+{
+    return span >= 0 && span < s->spans ? &s->span[span] : NULL;
+}
+
+int locagen_steer_hear(locagen_steer *memory, int32_t span, float share)
 {
     if (memory == NULL)
         return LOCAGEN_E_NULL;
+    steer *s = state_of(memory);
+    locagen_span *x = span_of(s, span);
+    if (x == NULL)
+        return LOCAGEN_E_SPAN;
     if (!within(share, 0, 1))
         return LOCAGEN_E_SHARE;
+    add(s, s->slot, share, x->signal, x->lost, &x->heard, &x->heard_variance, x->heard_weights);
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_watch(locagen_steer *memory, int32_t span, float share)
+{
+    if (memory == NULL)
+        return LOCAGEN_E_NULL;
     steer *s = state_of(memory);
-    s->heard = add(s, s->heard, share, s->lost_signal, s->signal);
-    double keep = 1.0f - share, with_old = 0;
-    for (int hop = 0; hop < s->hops; hop++)
-        with_old += s->overlap[hop] * keep * s->heard_weights[hop];
-    double fresh = (double)share;
-    s->heard_variance = keep * keep * s->heard_variance + fresh * fresh + 2 * fresh * with_old;
-    for (int hop = 7; hop > 0; hop--)
-        s->heard_weights[hop] = keep * s->heard_weights[hop - 1];
-    s->heard_weights[0] = share;
+    locagen_span *x = span_of(s, span);
+    if (x == NULL)
+        return LOCAGEN_E_SPAN;
+    if (!within(share, 0, 1))
+        return LOCAGEN_E_SHARE;
+    s->paths->watch(groups_of(s) * (long)DIRECTIONS * s->coarse.bins, share, x->over, x->spread);
+    x->watched = (double)(1.0f - share) * x->watched + (double)share;
+    return LOCAGEN_OK;
+}
+
+int locagen_steer_weigh(locagen_steer *memory, const float *weight)
+{
+    if (memory == NULL || weight == NULL)
+        return LOCAGEN_E_NULL;
+    steer *s = state_of(memory);
+    for (int k = 0; k < s->bins; k++)
+        if (!within((double)weight[k], 0, 1))
+            return LOCAGEN_E_WEIGHT;
+    memcpy(s->mask, weight, (size_t)s->bins * sizeof *weight);
     return LOCAGEN_OK;
 }
 
 /* Microphones that are in both R_n and R_x, as a mask; 0 where nothing can be looked for. */
-static int usable_mics(const steer *s)
+static int usable_mics(const steer *s, const locagen_span *x)
 {
     int mask = 0, count = 0;
     for (int m = 0; m < s->mics; m++) {
-        int lost = s->lost_signal[m] > LOST * s->heard || s->lost_noise[m] > LOST * s->learnt;
+        int lost = (double)x->lost[m] > LOST * x->heard || (double)s->lost_noise[m] > LOST * s->learnt;
         mask |= !lost << m;
         count += !lost;
     }
-    return s->heard > 0 && count >= 2 ? mask : 0;
+    return x->heard > 0 && count >= 2 ? mask : 0;
 }
 
-static void score_grid(const steer *s, enum locagen_measure measure)
+static double looks_of(const steer *s, double weight, double variance)
 {
-    int groups = (s->azimuths * s->elevations + DIRECTIONS - 1) / DIRECTIONS;
-    float *mean_q = s->scores + (long)groups * DIRECTIONS; /* nobody reads it */
-    s->paths->score(s, &s->coarse, measure, s->grid, groups, s->scores, mean_q);
+    return s->looks * weight * weight / variance;
+}
+
+/* Independent looks in R_x, less what R_n itself does not know: the ratio of two averages varies as if it
+ * held fewer (the F distribution's variance, to first order). */
+static double looks(const steer *s, const locagen_span *x)
+{
+    double signal = looks_of(s, x->heard, x->heard_variance);
+    if (s->learnt <= 0)
+        return signal;
+    double noise = looks_of(s, s->learnt, s->learnt_variance);
+    return signal * noise / (signal + noise);
+}
+
+/* How far q has spread, against theory's 1 / (looks * bins averaged), as a rate and an offset that theory
+ * adds to what was watched: see locagen_spread. */
+static locagen_spread spread_of(const steer *s, locagen_span *x)
+{
+    locagen_spread spread = {.over = x->over};
+    if (x->watched <= 0 || s->learnt <= 0)
+        return spread;
+    double averaged = (2 * s->coarse.half + 1) * (double)s->coarse.thinning;
+    double fresh = s->looks / looks_of(s, x->heard, x->heard_variance); /* of each hop's q, what is new */
+    double prior = PRIOR_LOOKS / fresh * WATCH_SHARE, total = x->watched + prior;
+    spread.spread = x->spread;
+    spread.rate = (float)(looks(s, x) * averaged / total);
+    spread.offset = (float)(prior / total);
+    return spread;
+}
+
+/* What the bins are worth: looks, times the weight from outside. */
+static void count_bins(const steer *s, double t)
+{
+    for (int k = 0; k < s->bins; k++)
+        s->fine.looks[k] = (float)t * s->mask[k];
+    for (int k = 0; k < s->coarse.bins; k++) {
+        float sum = 0;
+        for (int n = 0; n < s->coarse.thinning; n++)
+            sum += s->mask[k * s->coarse.thinning + n];
+        s->coarse.looks[k] = (float)t * sum;
+    }
+}
+
+/* Where in `over` and `spread` a direction of the grid stands. */
+static long place_in_spread(const steer *s, int n)
+{
+    int width = s->paths->width;
+    return (long)(n / width) * s->coarse.bins * width + n % width;
+}
+
+/* By how much the spread lessens the looks of coarse bin k in a direction of the grid. */
+static double trust(const steer *s, const locagen_spread *spread, int n, int k)
+{
+    if (spread->spread == NULL)
+        return 1;
+    float watched = spread->spread[place_in_spread(s, n) + (long)k * s->paths->width];
+    return 1 / fmax(1, (double)(spread->rate * watched + spread->offset));
+}
+
+static void count_fine_bins(const steer *s, const locagen_spread *spread, double t, int n)
+{
+    for (int k = 0; k < s->bins; k++) {
+        int block = k / s->coarse.thinning;
+        block = block < s->coarse.bins ? block : s->coarse.bins - 1;
+        s->fine.looks[k] = (float)(t * trust(s, spread, n, block)) * s->mask[k];
+    }
+}
+
+static void score_grid(const steer *s, enum locagen_measure measure, const locagen_spread *spread,
+                       float *scores)
+{
+    float *mean_q = s->scores + (long)groups_of(s) * DIRECTIONS; /* nobody reads it */
+    s->paths->score(s, &s->coarse, measure, spread, s->grid, groups_of(s), scores, mean_q);
 }
 
 /* Whether the lobe of one direction may hold the other. */
@@ -396,11 +549,11 @@ static int same_lobe(const steer *s, const double u[3], const double v[3])
 }
 
 /* The best direction of the grid outside the lobes of those before it. */
-static int next_on_grid(const steer *s, const int *before, int count_before)
+static int next_on_grid(const steer *s, const float *scores, const int *before, int count_before)
 {
     int best = -1;
     for (int n = 0; n < s->azimuths * s->elevations; n++) {
-        if (best >= 0 && !(s->scores[n] > s->scores[best]))
+        if (best >= 0 && !(scores[n] > scores[best]))
             continue;
         int apart = 1;
         for (int i = 0; i < count_before && apart; i++)
@@ -412,6 +565,7 @@ static int next_on_grid(const steer *s, const int *before, int count_before)
 }
 
 typedef struct {
+    int at;              /* on the grid, where the refinement began */
     double u[3], score, mean_q;
     double along[2][3];  /* the coordinates' axes */
     double hessian[3];   /* xx, xy, yy */
@@ -469,7 +623,7 @@ static void refine_once(const steer *s, enum locagen_measure measure, double h, 
         moved(s, a, h * AT[n][0], h * AT[n][1], u);
         put_phases(s, u, s->spectrum.first_bin, 1, s->aim + n);
     }
-    s->paths->score(s, &s->fine, measure, s->aim, 1, score, mean_q);
+    s->paths->score(s, &s->fine, measure, &PLAIN, s->aim, 1, score, mean_q);
     double f[DIRECTIONS];
     for (int n = 0; n < DIRECTIONS; n++)
         f[n] = (double)score[n];
@@ -513,50 +667,76 @@ static void refine(const steer *s, enum locagen_measure measure, aim *a)
 }
 
 /* The best direction of all. The grid may put lobes in a wrong order that differ by less than it loses
- * beside a lobe's top: then several are refined. Returns 0 where nothing scores. */
-static int find_best(const steer *s, enum locagen_measure measure, aim *best)
+ * beside a lobe's top: then several are refined. Returns 0 where nothing scores more than `least`. `t`:
+ * looks. */
+static int find_best(const steer *s, enum locagen_measure measure, const locagen_spread *spread, double t,
+                     float least, float *scores, aim *best)
 {
     int top[MOST_LOBES], lobes = 0;
-    score_grid(s, measure);
+    score_grid(s, measure, spread, scores);
     for (; lobes < MOST_LOBES; lobes++) {
-        top[lobes] = next_on_grid(s, top, lobes);
-        if (top[lobes] < 0 || !(s->scores[top[lobes]] > CLOSE * s->scores[top[0]]))
+        top[lobes] = next_on_grid(s, scores, top, lobes);
+        if (top[lobes] < 0 || !(scores[top[lobes]] > CLOSE * scores[top[0]]))
             break;
-        aim a;
+        if (!(scores[top[0]] > CLOSE * least))
+            return 0;
+        aim a = {.at = top[lobes]};
         memcpy(a.u, s->grid_u + 3 * top[lobes], sizeof a.u);
+        count_fine_bins(s, spread, t, a.at);
         refine(s, measure, &a);
         if (lobes == 0 || a.score > best->score)
             *best = a;
     }
-    return lobes > 0 && best->score > 0;
+    return lobes > 0 && best->score > (double)least;
 }
 
 /* How R_n is to be had; where it was never learnt, its level from the power across the direction of most
- * power. */
-static locagen_whitening whitening(steer *s)
+ * power. Leaves its inverse for whitening. */
+static locagen_whitening whitening(steer *s, const locagen_span *x)
 {
-    locagen_whitening how = {.mics = usable_mics(s), .signal_scale = (float)(1 / s->heard)};
+    locagen_whitening how = {.span = x, .mics = usable_mics(s, x), .signal_scale = (float)(1 / x->heard)};
     float count = (float)__builtin_popcount((unsigned)how.mics);
     s->fine.least = s->coarse.least = LEAST_DENOMINATOR * count;
     if (s->learnt > 0) {
         how.noise_scale = (float)(1 / s->learnt);
+        if (s->inverse_mics != how.mics)
+            s->paths->invert(s, &how);
+        s->inverse_mics = how.mics;
         return how;
     }
     how.white = 1.0f;
+    s->paths->invert(s, &how);
     s->paths->whiten(s, &how);
     double total = 0;
     for (int k = 0; k < s->bins; k++)
         total += (double)s->fine.planes[k];
     aim a;
-    double along = find_best(s, MEASURE_POWER, &a) ? a.score : 0;
+    double along = find_best(s, MEASURE_POWER, &PLAIN, 1, 0, s->scores, &a) ? a.score : 0;
     double across = (total - along) / (s->bins * ((double)count - 1));
     how.white = (float)fmax(fmax(across, WHITE_SHARE * total / s->bins), (double)s->floor);
+    s->paths->invert(s, &how);
+    s->inverse_mics = 0;
     return how;
 }
 
-static double looks(const steer *s)
+/* Log-likelihood ratio of "one source" against "all of the noise has become louder": from the last scores of
+ * the grid. What M microphones hear incoherently is M g(p) of their mean power p. */
+static double contrast(const steer *s, const locagen_spread *spread, int n, int mics)
 {
-    return s->looks * s->heard * s->heard / s->heard_variance;
+    const locagen_response *r = &s->coarse;
+    const float *power = r->planes + (2 + 4 * (long)s->pairs) * r->stride;
+    const float *over = spread->over + place_in_spread(s, n);
+    double sum = 0;
+    for (int k = 0; k < r->bins; k++) {
+        int first = k - r->half > 0 ? k - r->half : 0;
+        int last = k + r->half < r->bins - 1 ? k + r->half : r->bins - 1;
+        double p = 0, q = (double)over[(long)k * s->paths->width];
+        for (int i = first; i <= last; i++)
+            p += (double)power[i];
+        p = fmax(0, p / (r->thinning * (last - first + 1.0)) - 1);
+        sum += (double)r->looks[k] * trust(s, spread, n, k) * (q - log1p(q) - mics * (p - log1p(p)));
+    }
+    return sum;
 }
 
 static void add_null(steer *s, int source, const double u[3])
@@ -573,7 +753,7 @@ static void add_null(steer *s, int source, const double u[3])
     }
 }
 
-static locagen_source told(const aim *a, double t, int mics)
+static locagen_source told(const aim *a, int mics)
 {
     double azimuth[3], elevation[3];
     arcs(a->u, azimuth, elevation);
@@ -588,9 +768,9 @@ static locagen_source told(const aim *a, double t, int mics)
     return (locagen_source){
         .azimuth_rad = level > 1e-9 ? (float)atan2(a->u[1], a->u[0]) : 0.0f,
         .elevation_rad = (float)atan2(-a->u[2], level),
-        .score = (float)(t * a->score),
+        .score = (float)a->score,
         .snr = (float)fmax(0, (a->mean_q - 1) / __builtin_popcount((unsigned)mics)),
-        .information = {(float)(-t * xx), (float)(-t * xy), (float)(-t * yy)},
+        .information = {(float)-xx, (float)-xy, (float)-yy},
     };
 }
 
@@ -599,7 +779,7 @@ static locagen_source told(const aim *a, double t, int mics)
  * holds no source would cost the others many degrees (measured: up to 16). */
 static int is_sure(const steer *s, const aim *aims, const double *score, int n)
 {
-    int sure = looks(s) * score[n] > 4.0 * s->bins / (2 * s->fine.half + 1) && score[n] > 0.05 * score[0];
+    int sure = score[n] > 4.0 * s->bins / (2 * s->fine.half + 1) && score[n] > 0.05 * score[0];
     for (int before = 0; before < n; before++)
         sure &= !same_lobe(s, aims[n].u, aims[before].u);
     return sure;
@@ -607,7 +787,8 @@ static int is_sure(const steer *s, const aim *aims, const double *score, int n)
 
 /* Each direction anew with all others nulled, twice round: a source found first was found with the others in
  * the way (the relaxation of Li & Stoica 1996, "Efficient mixed-spectrum estimation"). */
-static void relax(steer *s, locagen_whitening how, int found, aim *aims)
+static void relax(steer *s, locagen_whitening how, const locagen_spread *spread, double t, int found,
+                  aim *aims)
 {
     how.nulls = found - 1;
     for (int step = 0; step < 2 * found; step++) {
@@ -616,29 +797,43 @@ static void relax(steer *s, locagen_whitening how, int found, aim *aims)
             if (&aims[other] != a)
                 add_null(s, slot++, aims[other].u);
         s->paths->whiten(s, &how);
+        count_fine_bins(s, spread, t, a->at);
         refine(s, MEASURE_RATIO, a);
     }
 }
 
-int locagen_steer_search(locagen_steer *memory, int32_t most, locagen_source *out)
+int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, float least, locagen_source *out)
 {
     if (memory == NULL || out == NULL)
         return LOCAGEN_E_NULL;
     if (most < 1)
         return LOCAGEN_E_COUNT;
+    if (!within((double)least, 0, (double)FLT_MAX))
+        return LOCAGEN_E_LEAST;
     steer *s = state_of(memory);
-    if (usable_mics(s) == 0)
+    locagen_span *x = span_of(s, span);
+    if (x == NULL)
+        return LOCAGEN_E_SPAN;
+    if (usable_mics(s, x) == 0) {
+        memset(x->scores, 0, (size_t)groups_of(s) * DIRECTIONS * sizeof *x->scores);
+        memset(x->over, 0, (size_t)groups_of(s) * DIRECTIONS * (size_t)s->coarse.bins * sizeof *x->over);
         return 0;
-    locagen_whitening how = whitening(s);
+    }
+    locagen_whitening how = whitening(s, x);
+    locagen_spread spread = spread_of(s, x);
     int count = __builtin_popcount((unsigned)how.mics), found = 0;
     aim aims[MOST_MICS];
-    double score[MOST_MICS], mean_q[MOST_MICS];
+    double score[MOST_MICS], mean_q[MOST_MICS], t = looks(s, x), first = 0;
+    count_bins(s, t);
     for (; found < most && found < count - 1; found++, how.nulls++) {
         aim *a = &aims[found];
         s->paths->whiten(s, &how);
-        if (!find_best(s, MEASURE_RATIO, a))
+        if (!find_best(s, MEASURE_RATIO, &spread, t, least, found == 0 ? x->scores : s->scores, a))
             break;
         score[found] = a->score, mean_q[found] = a->mean_q;
+        if (found == 0)
+            first = contrast(s, &spread, a->at, count);
+        spread.over = NULL; /* with nulls they would not be those of the noise */
         add_null(s, found, a->u);
         s->fine.least = s->coarse.least = LEAST_AFTER_NULL * (float)count;
     }
@@ -646,10 +841,11 @@ int locagen_steer_search(locagen_steer *memory, int32_t most, locagen_source *ou
     while (sure < found && is_sure(s, aims, score, sure))
         sure++;
     if (sure > 1)
-        relax(s, how, sure, aims);
+        relax(s, how, &spread, t, sure, aims);
     for (int n = 0; n < found; n++) {
         aims[n].score = score[n], aims[n].mean_q = mean_q[n];
-        out[n] = told(&aims[n], looks(s), how.mics);
+        out[n] = told(&aims[n], how.mics);
+        out[n].contrast = (float)first;
     }
     return found;
 }
@@ -671,8 +867,9 @@ int locagen_steer_bins(const locagen_steer *memory, float *bins)
     const steer *s = state_of(memory);
     for (int m = 0; m < s->mics; m++)
         for (int k = 0; k < s->bins; k++) {
-            *bins++ = s->bins_re[m * (long)s->stride + k];
-            *bins++ = s->bins_im[m * (long)s->stride + k];
+            long at = (s->slot * (long)s->mics + m) * s->stride + k;
+            *bins++ = s->bins_re[at];
+            *bins++ = s->bins_im[at];
         }
     return LOCAGEN_OK;
 }
@@ -710,20 +907,13 @@ int locagen_steer_axes(const locagen_steer *memory, float *elevation, float *azi
     return LOCAGEN_OK;
 }
 
-int locagen_steer_map(locagen_steer *memory, float *map)
+int locagen_steer_map(const locagen_steer *memory, int32_t span, float *map)
 {
     if (memory == NULL || map == NULL)
         return LOCAGEN_E_NULL;
-    steer *s = state_of(memory);
-    int count = s->azimuths * s->elevations;
-    if (usable_mics(s) == 0) {
-        memset(map, 0, (size_t)count * sizeof *map);
-        return LOCAGEN_OK;
-    }
-    locagen_whitening how = whitening(s);
-    s->paths->whiten(s, &how);
-    score_grid(s, MEASURE_RATIO);
-    for (int n = 0; n < count; n++)
-        map[n] = (float)looks(s) * s->scores[n];
+    const steer *s = state_of(memory);
+    if (span < 0 || span >= s->spans)
+        return LOCAGEN_E_SPAN;
+    memcpy(map, s->span[span].scores, (size_t)(s->azimuths * s->elevations) * sizeof *map);
     return LOCAGEN_OK;
 }

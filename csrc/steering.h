@@ -10,19 +10,34 @@
 
 enum {
     MOST_MICS = 8,
+    MOST_SPANS = 4,
+    MOST_LAG = 64,
     DIRECTIONS = 8, /* directions scored side by side, in one vector or two */
     BIN_BLOCK = 16  /* planes are padded to whole cache lines */
 };
 
 /* What a search reads: numerator and denominator of q as sums over pairs. Two diagonals' sums first, then of
- * each pair re and im of the numerator, re and im of the denominator. */
+ * each pair re and im of the numerator, re and im of the denominator; at last the power of all microphones. */
 typedef struct {
     int32_t bins, stride, half; /* half: bins each side that q is averaged over */
-    float weight;               /* bins of the band that one of these stands for */
+    int32_t thinning;           /* bins of the band that one of these stands for */
     float least;                /* denominators below it count as this */
     float *planes;
     float *share;               /* of each bin: 1 / bins that its average holds */
+    float *looks;               /* that each bin is worth */
 } locagen_response;
+
+/* One average R_x, and what its q have been while nothing called. */
+typedef struct {
+    double heard;               /* sum of the weights in R_x: 0 at the start, then towards 1 */
+    double heard_variance, heard_weights[8];
+    double watched;             /* sum of the weights in `spread` */
+    float lost[MOST_MICS];      /* of heard, what lacks this microphone */
+    float *signal;              /* R_x times the sum of its weights */
+    float *scores;              /* of the grid, in the last search */
+    float *over, *spread;       /* [vector of directions][coarse bin][lane]: q - 1 where above 0, in the last
+                                 * search; twice its mean square times the sum of the weights */
+} locagen_span;
 
 struct locagen_steer_paths;
 
@@ -39,24 +54,34 @@ typedef struct steer {
     double overlap[8];          /* squared coherence of the windows of frames 1 .. hops apart */
     int32_t hops;
 
-    int32_t frame_mics;         /* mask: microphones that the last frame may be used of */
-    double learnt, heard;       /* sum of the weights in R_n, R_x: 0 at the start, then towards 1 */
-    double heard_variance, heard_weights[8];
-    float lost_noise[MOST_MICS], lost_signal[MOST_MICS]; /* of those weights, what lacks this microphone */
+    int32_t lag, spans;
+    int32_t slot, listened;     /* of the ring: where the last frame is, how many frames it holds */
+    int32_t frame_mics[MOST_LAG + 1]; /* masks: microphones that each frame may be used of */
+    double learnt, learnt_variance; /* sum of the weights in R_n: 0 at the start, then towards 1 */
+    double learnt_weights[8];
+    float lost_noise[MOST_MICS];
+    float smear;
+    int32_t smear_half;         /* bins each side */
+    int32_t inverse_mics;       /* that `inverse` was made for; 0: it has to be made anew */
 
-    float *bins_re, *bins_im;   /* [mic][stride]: the last frame */
-    float *noise, *signal;      /* matrices R_n, R_x times the sum of their weights */
+    float *bins_re, *bins_im;   /* [frame of the ring][mic][stride] */
+    float *noise;               /* matrix R_n times the sum of its weights */
+    float *smeared;             /* the same, averaged over neighbouring bins */
+    float *inverse, *rate;      /* (R_n / level + loading)^-1; 1 / level */
+    float *mask;                /* [stride]: weight of each bin, 0 to 1 */
+    locagen_span span[MOST_SPANS];
     locagen_response fine, coarse;
     float *nulls;               /* [source][mic][re, im][stride]: the phases of sources found */
     float *grid;                /* [group of directions][mic][start re, im, step re, im][DIRECTIONS] */
     float *aim;                 /* one such group, of the refinement */
-    float *scores;              /* of the grid */
+    float *scores;              /* of the grid with nulls, or of its powers */
     float *q;                   /* [bin][lane] */
     double *grid_u;             /* [direction][3] */
 } steer;
 
 /* How the matrices of a search are to be made. */
 typedef struct {
+    const locagen_span *span;
     int32_t mics;               /* mask */
     int32_t nulls;
     float noise_scale, signal_scale; /* 1 / sum of the weights */
@@ -65,12 +90,24 @@ typedef struct {
 
 enum locagen_measure { MEASURE_RATIO, MEASURE_POWER }; /* sum of g(q), or of q */
 
+/* Beside the scores of the grid: where to put its q, and by how much each has spread before:
+ * looks / max(1, rate * spread + offset). */
+typedef struct {
+    float *over;                /* null: nowhere */
+    const float *spread;        /* null: as theory says */
+    float rate, offset;
+} locagen_spread;
+
 typedef struct locagen_steer_paths {
+    int32_t width;              /* lanes */
     int (*listen)(steer *s, const float *in, float *power);
-    void (*add)(const steer *s, float keep, float share, float *matrix);
+    void (*add)(const steer *s, int32_t slot, float keep, float share, float *matrix);
+    void (*watch)(long count, float share, const float *over, float *spread);
+    void (*invert)(const steer *s, const locagen_whitening *how);
     void (*whiten)(const steer *s, const locagen_whitening *how);
     void (*score)(const steer *s, const locagen_response *r, enum locagen_measure measure,
-                  const float *phases, int32_t groups, float *score, float *mean_q);
+                  const locagen_spread *spread, const float *phases, int32_t groups, float *score,
+                  float *mean_q);
 } locagen_steer_paths;
 
 extern const locagen_steer_paths locagen_steer_quad;

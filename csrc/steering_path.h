@@ -84,14 +84,14 @@ INLINE vec logarithm(vec x)
     return exponent * 0.69314718f + 2.0f * t * (1.0f + s * (1.0f / 3 + s * (1.0f / 5 + s * (1.0f / 7))));
 }
 
-/* From q at every bin to the score: the average over neighbours as a running sum, g, the sum over bins. */
-STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const float *q, float *score,
-                 float *mean_q)
+/* From q at every bin to the score: the average over neighbours as a running sum, g, the sum over bins.
+ * `at`: where in the spread the directions' own begins. */
+STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const locagen_spread *spread,
+                 long at, const float *q, float *score, float *mean_q)
 {
-    enum { FACTORS = 4 };             /* one logarithm for the product of so many */
-    const vec one = all(1.0f), most = all(1e9f); /* 90 dB; the product stays in range */
+    const vec one = all(1.0f), most = all(1e9f); /* 90 dB: its square is finite */
     long bins = r->bins, half = r->half;
-    vec plain = all(0.0f), sum = all(0.0f), logs = all(0.0f), window = all(0.0f), factor = one;
+    vec plain = all(0.0f), sum = all(0.0f), window = all(0.0f);
     for (long k = 0; k < half; k++)
         window += load(q + k * WIDTH);
     for (long k = 0; k < bins; k++) {
@@ -103,25 +103,37 @@ STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const 
         if (k > half)
             window -= load(q + (k - half - 1) * WIDTH);
         vec over = larger(window * r->share[k] - one, all(0.0f));
-        sum += over;
-        factor += factor * -larger(-over, -most);
-        if (k % FACTORS == FACTORS - 1) {
-            logs += logarithm(factor);
-            factor = one;
-        }
+        vec looks = all(r->looks[k]);
+        if (spread->spread)
+            looks /= larger(spread->rate * load(spread->spread + at + k * WIDTH) + spread->offset, one);
+        if (spread->over)
+            store(spread->over + at + k * WIDTH, -larger(-over, -most));
+        sum += looks * (over - logarithm(one + over));
     }
-    logs += logarithm(factor);
-    store(score, measure == MEASURE_POWER ? plain : r->weight * (sum - logs));
+    store(score, measure == MEASURE_POWER ? plain : sum);
     store(mean_q, plain * (1.0f / (float)bins));
 }
 
-static void score_groups(const steer *s, const locagen_response *r, enum locagen_measure measure,
-                         const float *phases, int32_t groups, float *score, float *mean_q)
+/* Half of the deviations from 1, those above it, stand for all. */
+STEP void watch(long count, float share, const float *over, float *spread)
 {
+    float keep = 1.0f - share, twice = 2.0f * share;
+    for (long n = 0; n < count; n += WIDTH) {
+        vec x = load(over + n);
+        store(spread + n, keep * load(spread + n) + twice * x * x);
+    }
+}
+
+static void score_groups(const steer *s, const locagen_response *r, enum locagen_measure measure,
+                         const locagen_spread *spread, const float *phases, int32_t groups, float *score,
+                         float *mean_q)
+{
+    long at = 0;
     for (int32_t group = 0; group < groups; group++, phases += 4 * DIRECTIONS * (s->mics - 1))
         for (int lane = 0; lane < DIRECTIONS; lane += WIDTH, score += WIDTH, mean_q += WIDTH) {
             RESPONSES_OF[s->mics](r, phases + lane, s->q);
-            sum_up(r, measure, s->q, score, mean_q);
+            sum_up(r, measure, spread, at, s->q, score, mean_q);
+            at += (long)r->bins * WIDTH;
         }
 }
 

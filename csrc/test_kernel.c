@@ -327,19 +327,19 @@ static void test_refusals(void)
     CHECK(locagen_gcc_process(b.kernel, b.in, NULL, b.power) == LOCAGEN_E_NULL, "no correlation");
     CHECK(locagen_gcc_process(b.kernel, b.in, b.correlation, NULL) == LOCAGEN_E_NULL, "no power");
     tear_down(&b);
-    for (int code = LOCAGEN_E_COUNT - 1; code <= 1; code++) {
+    for (int code = LOCAGEN_E_LEAST - 1; code <= 1; code++) {
         const char *words = locagen_strerror(code);
         CHECK(strlen(words) > 5, "code %d", code);
-        CHECK((strcmp(words, locagen_strerror(INT32_MIN)) == 0) == (code < LOCAGEN_E_COUNT), "code %d", code);
+        CHECK((strcmp(words, locagen_strerror(INT32_MIN)) == 0) == (code < LOCAGEN_E_LEAST), "code %d", code);
     }
 }
 
 /* --- the steered search */
 
 static const locagen_steer_config STEERED = {
-    .mics = 3, .frame = 512, .hop = 256, .smooth_bins = 6, .azimuths = 60, .elevations = 7, .rate_hz = 10000.0f,
-    .band_low_hz = 300.0f, .band_high_hz = 4700.0f, .taper = 0.1f, .loading = 1e-3f, .floor = 1e-12f,
-    .speed_m_s = 343.0f,
+    .mics = 3, .frame = 512, .hop = 256, .spans = 2, .smooth_bins = 6, .azimuths = 60, .elevations = 7, .rate_hz = 10000.0f,
+    .band_low_hz = 300.0f, .band_high_hz = 4700.0f, .taper = 0.1f, .loading = 1e-3f, .smear = 0.03f,
+    .floor = 1e-12f, .speed_m_s = 343.0f,
     .positions_m = {0.0577f, 0.0f, 0.0f, -0.0289f, 0.05f, 0.0f, -0.0289f, -0.05f, 0.0f, 0.0f, 0.0f, -0.08f,
                     0.05f, 0.05f, 0.02f, -0.05f, 0.03f, 0.03f, 0.01f, -0.04f, -0.05f, 0.02f, 0.02f, 0.06f},
 };
@@ -468,15 +468,15 @@ static void test_steered_angles(const locagen_steer_paths *chosen)
                 add_wave(&b, azimuth, elevation, 0.1f);
                 add_hiss(&b, 0.1f);
                 CHECK(locagen_steer_listen(b.kernel, b.in, b.power) == 0, "finite");
-                locagen_steer_hear(b.kernel, 1.0f);
-                int found = locagen_steer_search(b.kernel, config.mics, b.sources);
+                locagen_steer_hear(b.kernel, 0, 1.0f);
+                int found = locagen_steer_search(b.kernel, 0, config.mics, 0, b.sources);
                 CHECK(found >= 1 && found < config.mics, "case %zu: %d sources", n, found);
                 /* 10 dB and more: under a degree, a few where the band is narrow. */
                 double error = off_by(b.sources, azimuth, elevation);
                 CHECK(error < 3, "case %zu, learnt %d, corner %d: %.2f degrees", n, learnt, corner, error);
                 for (int source = 0; source < found; source++)
                     CHECK(all_finite(&b.sources[source]), "case %zu, source %d", n, source);
-                CHECK(locagen_steer_map(b.kernel, b.map) == 0, "map");
+                CHECK(locagen_steer_map(b.kernel, 0, b.map) == 0, "map");
             }
         float *bins = allocate(sizeof(float) * 2 * (size_t)(config.mics * b.bins));
         float *noise = allocate(sizeof(float) * 2 * (size_t)(config.mics * config.mics * b.bins));
@@ -501,8 +501,8 @@ static void test_steered_poles(const locagen_steer_paths *chosen)
             be_silent(&b);
             add_wave(&b, 0.3, pole ? -1.5707963267948966 : 0.0, 0.1f);
             locagen_steer_listen(b.kernel, b.in, b.power);
-            locagen_steer_hear(b.kernel, 1.0f);
-            int found = locagen_steer_search(b.kernel, 1, b.sources);
+            locagen_steer_hear(b.kernel, 0, 1.0f);
+            int found = locagen_steer_search(b.kernel, 0, 1, 0, b.sources);
             CHECK(found == 1 && all_finite(b.sources), "%d mics, pole %d: %d", mics, pole, found);
             double error = off_by(b.sources, 0.3, pole ? -1.5707963267948966 : 0.0);
             CHECK(mics == 2 || error < 2, "%d mics, pole %d: %.2f degrees", mics, pole, error);
@@ -529,9 +529,9 @@ static void test_steered_faults(const locagen_steer_paths *chosen)
                 int bad = locagen_steer_listen(b.kernel, b.in, b.power);
                 CHECK(bad == (faults[fault] == 0.0f ? 0 : 1 << faulty), "%d mics, fault %zu: %d", mics, fault, bad);
                 CHECK(b.power[faulty] == 0.0f, "power %g", (double)b.power[faulty]);
-                (frame < 3 ? locagen_steer_learn : locagen_steer_hear)(b.kernel, 0.5f);
+                frame < 3 ? locagen_steer_learn(b.kernel, 0.5f) : locagen_steer_hear(b.kernel, 0, 0.5f);
             }
-            int found = locagen_steer_search(b.kernel, 8, b.sources);
+            int found = locagen_steer_search(b.kernel, 0, 8, 0, b.sources);
             CHECK(found < mics && (found > 0) == (mics > 2), "%d mics, fault %zu: %d found", mics, fault, found);
             for (int source = 0; source < found; source++)
                 CHECK(all_finite(&b.sources[source]), "%d mics, fault %zu", mics, fault);
@@ -541,16 +541,84 @@ static void test_steered_faults(const locagen_steer_paths *chosen)
         }
 }
 
+/* What is learnt is the frame `lag` hops ago, of the ring's every turn; the largest lag of all in bounds. */
+static void test_steered_lag(const locagen_steer_paths *chosen)
+{
+    for (int lag = 0; lag <= MOST_LAG; lag += 1 + lag) {
+        locagen_steer_config config = STEERED;
+        config.lag = lag;
+        steer_bench b = steer_set_up(config, chosen);
+        float *now = malloc(sizeof(float) * (size_t)(2 * b.bins * config.mics));
+        float *noise = malloc(sizeof(float) * (size_t)(2 * b.bins * config.mics * config.mics));
+        float *powers = malloc(sizeof(float) * (size_t)(3 * lag + 3));
+        CHECK(now && noise && powers, "memory");
+        for (int n = 0; n < 3 * lag + 3; n++) {
+            be_silent(&b);
+            add_hiss(&b, 0.1f);
+            locagen_steer_listen(b.kernel, b.in, b.power);
+            locagen_steer_bins(b.kernel, now);
+            powers[n] = now[0] * now[0] + now[1] * now[1];
+            CHECK(locagen_steer_learn(b.kernel, 1.0f) == 0, "learnt");
+            locagen_steer_noise(b.kernel, noise);
+            float expected = n < lag ? 0.0f : powers[n - lag];
+            CHECK(fabsf(noise[0] - expected) <= 1e-5f * expected, "lag %d, frame %d", lag, n);
+        }
+        free(now), free(noise), free(powers);
+        steer_tear_down(&b);
+    }
+}
+
+/* Spans do not know of each other; weights of 0 leave nothing; watching harms no direction that kept still. */
+static void test_steered_spans(const locagen_steer_paths *chosen)
+{
+    steer_bench b = steer_set_up(STEERED, chosen);
+    learn_hiss(&b, 60);
+    be_silent(&b);
+    add_hiss(&b, 0.1f);
+    locagen_steer_listen(b.kernel, b.in, b.power);
+    locagen_steer_hear(b.kernel, 1, 1.0f);
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "span 0 has heard nothing");
+    CHECK(locagen_steer_search(b.kernel, 1, 1, 0, b.sources) == 1, "span 1 has");
+    CHECK(locagen_steer_watch(b.kernel, 1, 0.1f) == 0, "watched");
+    add_wave(&b, 1.0, -0.5, 0.1f);
+    locagen_steer_listen(b.kernel, b.in, b.power);
+    locagen_steer_hear(b.kernel, 0, 1.0f), locagen_steer_hear(b.kernel, 1, 1.0f);
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 1, "a call");
+    float score = b.sources[0].score;
+    CHECK(b.sources[0].contrast > -0.1f * score, "one source is as good a reason: %g of %g",
+          (double)b.sources[0].contrast, (double)score);
+    CHECK(locagen_steer_search(b.kernel, 1, 1, 0, b.sources) == 1, "a call, watched");
+    CHECK(b.sources[0].score <= score * 1.001f, "watching only lessens: %g, %g", (double)b.sources[0].score,
+          (double)score);
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 2 * score, b.sources) == 0, "not loud enough");
+    float *weight = calloc((size_t)b.bins, sizeof *weight);
+    CHECK(weight && locagen_steer_weigh(b.kernel, weight) == 0, "no bin counts");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "nothing to score");
+    free(weight);
+    steer_tear_down(&b);
+
+    b = steer_set_up(STEERED, chosen);
+    learn_hiss(&b, 60);
+    be_silent(&b);
+    add_hiss(&b, 0.3f);
+    locagen_steer_listen(b.kernel, b.in, b.power);
+    locagen_steer_hear(b.kernel, 0, 1.0f);
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 1, "louder noise");
+    CHECK(b.sources[0].contrast < -0.5f * b.sources[0].score, "no source is the better reason: %g of %g",
+          (double)b.sources[0].contrast, (double)b.sources[0].score);
+    steer_tear_down(&b);
+}
+
 static void test_steered_silence(const locagen_steer_paths *chosen)
 {
     steer_bench b = steer_set_up(STEERED, chosen);
-    CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 0, "nothing heard");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "nothing heard");
     be_silent(&b);
     for (int learnt = 0; learnt < 2; learnt++) {
         CHECK(locagen_steer_listen(b.kernel, b.in, b.power) == 0, "silence is finite");
-        locagen_steer_hear(b.kernel, 1.0f);
-        CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 0, "silence, learnt %d", learnt);
-        CHECK(locagen_steer_map(b.kernel, b.map) == 0, "map");
+        locagen_steer_hear(b.kernel, 0, 1.0f);
+        CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "silence, learnt %d", learnt);
+        CHECK(locagen_steer_map(b.kernel, 0, b.map) == 0, "map");
         int wrong = 0;
         for (int n = 0; n < 60 * 7; n++)
             wrong += b.map[n] != 0.0f;
@@ -559,11 +627,11 @@ static void test_steered_silence(const locagen_steer_paths *chosen)
     }
     add_wave(&b, 1.0, -0.6, 0.1f);
     locagen_steer_listen(b.kernel, b.in, b.power);
-    locagen_steer_hear(b.kernel, 1.0f);
-    CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 1, "a source over silence");
+    locagen_steer_hear(b.kernel, 0, 1.0f);
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 1, "a source over silence");
     CHECK(all_finite(b.sources) && off_by(b.sources, 1.0, -0.6) < 1, "%.2f degrees", off_by(b.sources, 1.0, -0.6));
     locagen_steer_reset(b.kernel);
-    CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 0, "forgotten");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "forgotten");
     steer_tear_down(&b);
 }
 
@@ -578,8 +646,8 @@ static void test_steered_paths_agree(void)
     add_wave(&b, 1.0, -0.6, 0.05f);
     add_hiss(&b, 0.1f);
     locagen_steer_listen(b.kernel, b.in, b.power), locagen_steer_listen(c.kernel, b.in, c.power);
-    locagen_steer_hear(b.kernel, 1.0f), locagen_steer_hear(c.kernel, 1.0f);
-    CHECK(locagen_steer_search(b.kernel, 1, b.sources) == 1 && locagen_steer_search(c.kernel, 1, c.sources) == 1,
+    locagen_steer_hear(b.kernel, 0, 1.0f), locagen_steer_hear(c.kernel, 0, 1.0f);
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 1 && locagen_steer_search(c.kernel, 0, 1, 0, c.sources) == 1,
           "one source");
     /* Rounding through two inverses, of matrices from ten frames. */
     float ratio = b.sources->score / c.sources->score;
@@ -617,6 +685,11 @@ static void test_steered_refusals(void)
     STEER_REFUSED(taper, 1.01f, LOCAGEN_E_TAPER);
     STEER_REFUSED(smooth_bins, -1, LOCAGEN_E_SMOOTH);
     STEER_REFUSED(smooth_bins, 65, LOCAGEN_E_SMOOTH);
+    STEER_REFUSED(spans, 0, LOCAGEN_E_SPAN);
+    STEER_REFUSED(spans, 5, LOCAGEN_E_SPAN);
+    STEER_REFUSED(lag, -1, LOCAGEN_E_LAG);
+    STEER_REFUSED(lag, 65, LOCAGEN_E_LAG);
+    STEER_REFUSED(smear, NAN, LOCAGEN_E_NOISE);
     STEER_REFUSED(loading, 0.0f, LOCAGEN_E_NOISE);
     STEER_REFUSED(loading, INFINITY, LOCAGEN_E_NOISE);
     STEER_REFUSED(floor, 0.0f, LOCAGEN_E_NOISE);
@@ -640,13 +713,28 @@ static void test_steered_refusals(void)
     CHECK(locagen_steer_listen(b.kernel, NULL, b.power) == LOCAGEN_E_NULL, "no input");
     CHECK(locagen_steer_listen(b.kernel, b.in, NULL) == LOCAGEN_E_NULL, "no power");
     CHECK(locagen_steer_learn(NULL, 0.5f) == LOCAGEN_E_NULL, "no state");
-    CHECK(locagen_steer_hear(NULL, 0.5f) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_hear(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_learn(b.kernel, NAN) == LOCAGEN_E_SHARE, "no share");
-    CHECK(locagen_steer_hear(b.kernel, 1.5f) == LOCAGEN_E_SHARE, "too large a share");
-    CHECK(locagen_steer_search(NULL, 1, b.sources) == LOCAGEN_E_NULL, "no state");
-    CHECK(locagen_steer_search(b.kernel, 1, NULL) == LOCAGEN_E_NULL, "no output");
-    CHECK(locagen_steer_search(b.kernel, 0, b.sources) == LOCAGEN_E_COUNT, "no sources asked for");
-    CHECK(locagen_steer_map(b.kernel, NULL) == LOCAGEN_E_NULL, "no map");
+    CHECK(locagen_steer_hear(b.kernel, 0, 1.5f) == LOCAGEN_E_SHARE, "too large a share");
+    CHECK(locagen_steer_search(NULL, 0, 1, 0, b.sources) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, NULL) == LOCAGEN_E_NULL, "no output");
+    CHECK(locagen_steer_search(b.kernel, 0, 0, 0, b.sources) == LOCAGEN_E_COUNT, "no sources asked for");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, NAN, b.sources) == LOCAGEN_E_LEAST, "least");
+    for (int span = -1; span <= 2; span += 3) {
+        CHECK(locagen_steer_hear(b.kernel, span, 0.5f) == LOCAGEN_E_SPAN, "span %d", span);
+        CHECK(locagen_steer_watch(b.kernel, span, 0.5f) == LOCAGEN_E_SPAN, "span %d", span);
+        CHECK(locagen_steer_search(b.kernel, span, 1, 0, b.sources) == LOCAGEN_E_SPAN, "span %d", span);
+        CHECK(locagen_steer_map(b.kernel, span, b.map) == LOCAGEN_E_SPAN, "span %d", span);
+    }
+    CHECK(locagen_steer_watch(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_watch(b.kernel, 0, NAN) == LOCAGEN_E_SHARE, "no share");
+    CHECK(locagen_steer_weigh(NULL, b.in) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_weigh(b.kernel, NULL) == LOCAGEN_E_NULL, "no weights");
+    b.in[1] = 1.01f;
+    CHECK(locagen_steer_weigh(b.kernel, b.in) == LOCAGEN_E_WEIGHT, "a weight over 1");
+    b.in[1] = NAN;
+    CHECK(locagen_steer_weigh(b.kernel, b.in) == LOCAGEN_E_WEIGHT, "a weight that is none");
+    CHECK(locagen_steer_map(b.kernel, 0, NULL) == LOCAGEN_E_NULL, "no map");
     CHECK(locagen_steer_bins(b.kernel, NULL) == LOCAGEN_E_NULL, "no bins");
     CHECK(locagen_steer_noise(b.kernel, NULL) == LOCAGEN_E_NULL, "no noise");
     CHECK(locagen_steer_axes(b.kernel, b.map, NULL) == LOCAGEN_E_NULL, "no axes");
@@ -669,6 +757,8 @@ int main(void)
         test_steered_angles(steer_paths[n]);
         test_steered_poles(steer_paths[n]);
         test_steered_faults(steer_paths[n]);
+        test_steered_lag(steer_paths[n]);
+        test_steered_spans(steer_paths[n]);
         test_steered_silence(steer_paths[n]);
     }
     test_paths_agree();

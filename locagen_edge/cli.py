@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from locagen_edge import __version__
-from locagen_edge.errors import LocagenError, SettingsError, SourceHungError
+from locagen_edge.errors import CalibrationError, LocagenError, SourceHungError
 from locagen_edge.geometry import compass_deg
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
 from locagen_edge.types import Estimate
@@ -41,14 +41,11 @@ def main(argv: list[str] | None = None) -> None:
         sys.stdout.reconfigure(errors="replace")  # a terminal without a degree sign is no reason to stop
     try:
         code = arguments.command(arguments)
-    except SettingsError as error:
-        for line in str(error).splitlines():
-            print(f"locagen-edge: {line}", file=sys.stderr)
-        code = 1
     except SourceHungError as error:
         _leave(str(error))
     except LocagenError as error:
-        print(f"locagen-edge: {error}", file=sys.stderr)
+        for line in str(error).splitlines():  # one fault each
+            print(f"locagen-edge: {line}", file=sys.stderr)
         code = 1
     except BrokenPipeError:  # `| head` has seen enough: not a failure, and nothing may be written any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -138,7 +135,54 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument(
         "--seconds", type=_positive, default=2.0, metavar="N", help="how long to listen (default 2)"
     )
+    calibrate = command(
+        "calibrate",
+        _calibrate,
+        "measure the microphones' places, channel delays and gains from a sound walked round the array",
+        "Put the array level in the open, motors off, and walk once or more all the way round it, a few "
+        "metres away, with a loud broad-band sound (noise from a speaker, claps, speech) at its height. "
+        "Prints what was found with its 1-sigma; exit code 1, and nothing is written, where the recording "
+        "could not determine it. The angle table has the columns time_s (of the recording), azimuth_deg "
+        "(clockwise from ahead) and maybe elevation_deg; between two lines the sound goes the shorter way.",
+    )
+    calibrate.add_argument("file", type=Path, metavar="FILE.wav", help="WAV or FLAC, any rate, as recorded")
+    calibrate.add_argument("--write", type=Path, metavar="PATH", help="write settings with what was found")
+    calibrate.add_argument("--angles", type=Path, metavar="CSV", help="where the sound was; default: unknown")
+    calibrate.add_argument(
+        "--angle-sigma-deg", type=_positive, default=3.0, metavar="N", help="1-sigma of one line (default 3)"
+    )
+    calibrate.add_argument(
+        "--sense", choices=("clockwise", "anticlockwise"), help="which way you walked, seen from above"
+    )
+    calibrate.add_argument(
+        "--elevation-deg", type=_number(-60, 60), default=0.0, metavar="N",
+        help="of the sound seen from the array, positive up (default 0): it sets the scale",
+    )  # fmt: skip
+    calibrate.add_argument(
+        "--elevation-sigma-deg", type=_positive, default=2.0, metavar="N", help="its 1-sigma (default 2)"
+    )
+    calibrate.add_argument(
+        "--distance-m", type=_positive, default=math.inf, metavar="N",
+        help="from the array's middle, for the wave's curvature (default: unknown, 2 m or more)",
+    )  # fmt: skip
+    calibrate.add_argument(
+        "--margin", type=_number(1, 20), default=1.5, metavar="N",
+        help="search delays of an array so much larger (default 1.5): more for channels that are very late",
+    )  # fmt: skip
     return parser
+
+
+def _number(least: float, most: float) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number from {least:g} to {most:g}")
+        return value
+
+    return number
 
 
 def _positive(text: str) -> float:
@@ -241,8 +285,12 @@ def describe(estimate: Estimate) -> str:
         parts = [f"bearing {azimuth:5.1f}° ±{sigma:4.1f}°"]
     if truth is not None:
         parts.append(f"true {compass_deg(truth.azimuth_rad):5.1f}°")
+    if track is not None and track.earth is not None:
+        parts.append(f"from north {compass_deg(track.earth.azimuth_rad):5.1f}°")
     if track is not None and track.elevation_rad is not None:
         parts.append(f"el {math.degrees(track.elevation_rad):3.0f}°")
+    if len(estimate.tracks) > 1:
+        parts.append(f"{len(estimate.tracks)} callers")
     parts.append(f"snr {estimate.detection.snr_db:5.1f} dB {'CALL' if estimate.detection.call else '    '}")
     parts += [f"! {fault}" for fault in estimate.faults]
     return "  ".join(parts)
@@ -375,3 +423,34 @@ def _check(arguments: argparse.Namespace) -> int:
     if wrong:
         print(f"{wrong} of these need you")
     return 1 if wrong else 0
+
+
+# --- calibrate ----------------------------------------------------------------------------------------
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from locagen_edge import calibrate as door
+    from locagen_edge.calibration import Walk
+
+    settings = _settings(arguments)
+    walk = Walk(
+        elevation_rad=math.radians(arguments.elevation_deg),
+        elevation_sigma_rad=math.radians(arguments.elevation_sigma_deg),
+        distance_m=arguments.distance_m,
+        clockwise=None if arguments.sense is None else arguments.sense == "clockwise",
+        angle_sigma_rad=math.radians(arguments.angle_sigma_deg),
+    )
+    table = None if arguments.angles is None else door.read_angles(arguments.angles)
+    heard = door.hear(arguments.file, settings, arguments.margin)
+    if table is not None:
+        heard, walk = door.at_angles(heard, table, walk, arguments.angles)
+    found = door.fitted(heard, settings, walk)
+    for line in door.report(heard, found, settings, walk):
+        print(line)
+    if found.doubts:
+        written = ["nothing is written"] if arguments.write is not None else []
+        raise CalibrationError("\n".join([*found.doubts, *written]))
+    if arguments.write is not None:
+        door.write_settings(arguments.write, door.calibrated(settings, heard, found), arguments.file)
+        print(f"written     {arguments.write}")
+    return 0

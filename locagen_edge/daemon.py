@@ -89,7 +89,7 @@ class Daemon:
 
     async def startup(self) -> None:
         """Makes pipeline and link. Raises `LocagenError` where the settings cannot be flown with."""
-        self.component = Component(self.settings.mavlink)
+        self.component = Component(self.settings.mavlink, pose=self.settings.pose)
         self.link = Link(
             parse(self.settings.mavlink.link),
             backoff_s=self.settings.daemon.backoff_s,
@@ -189,7 +189,8 @@ class Daemon:
         frame_ns = round(self.settings.audio.frame / self.settings.audio.rate_hz * 1e9)
         while (frame := await self._queue.get()) is not None:
             self._working = True
-            self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame)
+            pose = self.component.poses.at(frame.t_ns + frame_ns // 2)
+            self.estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
             self._working = False
             self._heard_s = time.monotonic()
             self.counters.estimates += 1
@@ -226,7 +227,9 @@ class Daemon:
         estimate = self.estimate
         if estimate is None:
             return Status(hearing=True, track=None, snr_db=0.0, faults=())
-        return Status(True, estimate.track, estimate.detection.snr_db, estimate.faults)
+        return Status(
+            True, estimate.track, estimate.detection.snr_db, estimate.faults, others=estimate.tracks[1:]
+        )
 
     async def _tick(self) -> None:
         """What is due without a new estimate; once a second the status and the watchdog."""

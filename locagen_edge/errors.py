@@ -35,3 +35,7 @@ class KernelError(LocagenError):
 
 class DatasetError(LocagenError):
     """A data set that cannot be written, is not complete, or is not what the settings ask for."""
+
+
+class CalibrationError(LocagenError):
+    """A recording from which the array cannot be calibrated. The text says what is missing and what to do."""

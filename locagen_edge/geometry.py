@@ -1,4 +1,4 @@
-"""The array: positions, pairs, delays, and the angles between.
+"""The array: positions, pairs, delays, the angles between, and how body and earth are turned to each other.
 
 Axes are MAVLink's FRD: x forward, y right, z down, metres. Azimuth is atan2(y, x), so 0 is ahead and
 positive is clockwise seen from above; elevation is positive up. `u` is the unit vector from the array to
@@ -13,12 +13,15 @@ from functools import cached_property
 
 import numpy as np
 
-from locagen_edge.types import F64
+from locagen_edge.types import F64, Quaternion
 
 KELVIN = 273.15
 
 LAG_MARGIN_SAMPLES = 0.25
 """Noise moves the peak of a source in line with a pair beyond the longest delay: look a little further."""
+
+FLAT_M = 1e-4
+"""Thinner than this an array is flat: 0.1 mm is 0.3 us, a tenth of what a frame's noise leaves."""
 
 
 def speed_of_sound(temperature_c: float) -> float:
@@ -57,6 +60,72 @@ def compass_deg(angle_rad: float) -> float:
     return math.degrees(angle_rad) % 360.0 % 360.0  # twice: -1e-17 % 360 is 360.0
 
 
+# --- attitude: earth axes are north, east, down, so that azimuth counts from true north -----------------
+
+
+def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
+    """The attitude of MAVLink's roll, pitch and yaw: yaw about down first, then pitch, then roll.
+
+    Diebel, "Representing attitude: Euler angles, unit quaternions, and rotation vectors" (2006), section 8.
+    """
+    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def rotation(q: Quaternion) -> F64:
+    """(3, 3) matrix that does what `Pose.attitude` says: body (FRD) vectors into the earth's (NED).
+
+    Its transpose turns the earth's into the body's.
+    """
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
+    """The attitude `share` of the way from a to b, by the shorter way and at an even rate; a share above 1
+    goes on beyond b.
+
+    Shoemake, "Animating rotation with quaternion curves", SIGGRAPH 1985.
+    """
+    p, q = np.array(a), np.array(b)
+    near = float(p @ q)
+    if near < 0.0:  # q and -q are one attitude
+        q, near = -q, -near
+    angle = math.acos(min(near, 1.0))
+    if angle < 1e-6:  # sin(x) / x is 1 to 1e-13
+        mixed = p + share * (q - p)
+    else:
+        mixed = (math.sin((1.0 - share) * angle) * p + math.sin(share * angle) * q) / math.sin(angle)
+    w, x, y, z = (mixed / np.linalg.norm(mixed)).tolist()
+    return (w, x, y, z)
+
+
+def to_earth(q: Quaternion, azimuth_rad: float, elevation_rad: float) -> tuple[float, float]:
+    """Azimuth from true north and elevation over the horizon of a direction given in body axes."""
+    return angles(rotation(q) @ direction(azimuth_rad, elevation_rad))
+
+
+def to_body(q: Quaternion, azimuth_rad: float, elevation_rad: float) -> tuple[float, float]:
+    """Azimuth and elevation in body axes of a direction given from true north and over the horizon."""
+    return angles(rotation(q).T @ direction(azimuth_rad, elevation_rad))
+
+
+# --- the array ------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, eq=False)
 class MicArray:
     """Microphone positions and what follows from them alone."""
@@ -83,6 +152,18 @@ class MicArray:
         """(pairs,): distance between the two microphones."""
         distance: F64 = np.linalg.norm(self.baselines_m, axis=1)
         return distance
+
+    @cached_property
+    def normal(self) -> F64 | None:
+        """(3,) unit vector across a flat array, downwards: it hears a sound and its mirror image alike.
+
+        None for one that is not flat, or on one line.
+        """
+        _, extent, axes = np.linalg.svd(self.baselines_m)
+        if len(extent) < 3 or extent[1] < FLAT_M or extent[2] > FLAT_M:
+            return None
+        across: F64 = axes[2] * (1.0 if axes[2, 2] >= 0.0 else -1.0)
+        return across
 
     def longest_delay_s(self, speed_m_s: float) -> float:
         """The longest delay that any pair can see, seconds."""

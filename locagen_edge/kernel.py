@@ -137,6 +137,8 @@ class Source:
     """positive up; where the array is flat and level never above 0"""
     score: float
     """log of the likelihood ratio against "noise only"; noise alone gives some tens at 451 bins"""
+    contrast: float
+    """the same against "all of the noise is louder now", of the strongest source"""
     snr: float
     """power ratio per microphone, over the band's bins, as if the noise were white"""
     information: tuple[float, float, float]
@@ -162,8 +164,8 @@ class Source:
 class Steered:
     """Maximum likelihood over directions, with the noise's own cross-spectra.
 
-    For each frame: `listen`, then `learn` (while nothing calls) or `hear`, then `search`. Score and sources:
-    `csrc/locagen.h`.
+    For each frame: `listen`, then `hear` and `search`, for each span; then, while nothing calls, `learn` and
+    `watch`. Score and sources: `csrc/locagen.h`.
 
     Args:
         positions_m: microphones, shape `(mics, 3)`, FRD, metres; 2 to 8 of them.
@@ -175,7 +177,10 @@ class Steered:
         taper: share of the window that is tapered, 0 rectangle, 1 Hann. The default, 0.1, loses 3 % of
             accuracy to tapering, Hann 39 %; Hann keeps strong tones of the noise out of other bins.
         smooth_bins: bins each side over which the source's spectrum is taken for smooth.
+        spans: averages of the signal side by side, each with a memory of its own.
+        lag: `learn` takes the frame of so many hops ago: what calls is known only after a while.
         loading: added to the noise's diagonal, as a share of its mean: the deepest null is this deep.
+        smear: share of the noise's matrix, averaged over 100 Hz to each side, that is added to it.
         floor: the same as power of one bin, mean square of full scale.
         azimuths, elevations: the coarse grid; None: fine enough for the array.
 
@@ -201,7 +206,10 @@ class Steered:
         band_hz: tuple[float, float] = (300.0, 4700.0),
         taper: float = 0.1,
         smooth_bins: int = 6,
+        spans: int = 1,
+        lag: int = 0,
         loading: float = 1e-3,
+        smear: float = 0.0,
         floor: float = 1e-12,
         azimuths: int | None = None,
         elevations: int | None = None,
@@ -220,6 +228,8 @@ class Steered:
                     "mics": mics,
                     "frame": frame,
                     "hop": hop,
+                    "spans": spans,
+                    "lag": lag,
                     "smooth_bins": smooth_bins,
                     "azimuths": columns if azimuths is None else azimuths,
                     "elevations": rows if elevations is None else elevations,
@@ -228,6 +238,7 @@ class Steered:
                     "band_high_hz": band_hz[1],
                     "taper": taper,
                     "loading": loading,
+                    "smear": smear,
                     "floor": floor,
                     "speed_m_s": speed_m_s,
                     "positions_m": positions.ravel().tolist(),
@@ -277,33 +288,41 @@ class Steered:
         return self._power.copy(), bad
 
     def learn(self, share: float) -> None:
-        """Puts the frame into the noise's matrix: R <- (1 - share) R + share x x^H, share 0 to 1."""
+        """Puts the frame of `lag` hops ago into the noise's matrix: R <- (1 - share) R + share x x^H."""
         _check(lib.locagen_steer_learn(self._state, share))
 
-    def hear(self, share: float = 1.0) -> None:
-        """The same for the signal's matrix; 1: this frame alone."""
-        _check(lib.locagen_steer_hear(self._state, share))
+    def hear(self, share: float = 1.0, span: int = 0) -> None:
+        """The same for the signal's matrix of a span, with the last frame; 1: this frame alone."""
+        _check(lib.locagen_steer_hear(self._state, span, share))
 
-    def search(self, max_sources: int = 1) -> tuple[Source, ...]:
-        """The sources in the signal's matrix, strongest first; at most one less than there are microphones.
+    def watch(self, share: float, span: int = 0) -> None:
+        """Keeps in mind how the noise strayed in the last search, for scores that mean the same in all."""
+        _check(lib.locagen_steer_watch(self._state, span, share))
 
-        None before `hear`, in silence and with less than two microphones. Where nothing was learnt the noise
+    def weigh(self, weight: npt.NDArray[np.float32]) -> None:
+        """Weights 0 to 1 of all bins in the band, float32, shape `(bins,)`, for the searches to come."""
+        _check(lib.locagen_steer_weigh(self._state, _pointer(weight, (len(self.frequency_hz),))))
+
+    def search(self, max_sources: int = 1, span: int = 0, least: float = 0.0) -> tuple[Source, ...]:
+        """The sources in the span's matrix, strongest first; at most one less than there are microphones.
+
+        None before `hear`, in silence and with less than two microphones; none that scores `least` or less. Where nothing was learnt the noise
         is taken for white, and its level from what is across the best direction.
         """
         room = min(max_sources, _MOST_MICS)
-        found = _check(lib.locagen_steer_search(self._state, room, self._sources))
+        found = _check(lib.locagen_steer_search(self._state, span, room, least, self._sources))
         return tuple(
-            Source(s.azimuth_rad, s.elevation_rad, s.score, s.snr, tuple(s.information))
+            Source(s.azimuth_rad, s.elevation_rad, s.score, s.contrast, s.snr, tuple(s.information))
             for s in self._sources[0:found]
         )
 
-    def map(self) -> npt.NDArray[np.float32]:
-        """Scores on the coarse grid, float32, shape `(elevations, azimuths)`.
+    def map(self, span: int = 0) -> npt.NDArray[np.float32]:
+        """Scores of the span's last search on the coarse grid, float32, shape `(elevations, azimuths)`.
 
         Its axes are `elevation_rad` and `azimuth_rad`.
         """
         scores = np.empty(self._grid, _FLOAT32)
-        _check(lib.locagen_steer_map(self._state, ffi.from_buffer(_FLOATS, scores)))
+        _check(lib.locagen_steer_map(self._state, span, ffi.from_buffer(_FLOATS, scores)))
         return scores
 
     def bins(self) -> npt.NDArray[np.complex64]:

@@ -139,7 +139,7 @@ def _check_array(name: str, positions_m: Any, settings: Settings) -> None:
     same = wanted.shape == here.shape and np.allclose(wanted - wanted[0], here - here[0], atol=1e-3)
     if not same:
         raise ModelError(
-            f"model {name}: was trained for another array than array.positions_m; "
+            f"model {name}: was trained for another array than array.positions_m with array.mount_deg; "
             "train it for this one, or choose another bearing.estimator"
         )
 

@@ -15,7 +15,7 @@ from locagen_edge.stages.detection import Detector
 from locagen_edge.stages.faults import FaultFinder
 from locagen_edge.stages.tdoa import PeakPicker
 from locagen_edge.stages.track import Tracker
-from locagen_edge.types import Estimate, Frame
+from locagen_edge.types import Estimate, Frame, Pose
 
 
 class Pipeline:
@@ -36,12 +36,19 @@ class Pipeline:
         self._detect = Detector(settings.detection)
         self._find_faults = FaultFinder()
         self._track = Tracker(
-            settings.track, tolerance_rad(array, settings.array.tolerance_m), audio.frame / audio.hop
+            settings.track,
+            settings.pose,
+            tolerance_rad(array, settings.array.tolerance_m),
+            audio.frame / audio.hop,
+            array.normal,
         )
         self._last_ns: int | None = None
 
-    def process(self, frame: Frame) -> Estimate:
-        """The estimate for one frame. Frames have to come in the order of time; gaps are allowed."""
+    def process(self, frame: Frame, pose: Pose | None = None) -> Estimate:
+        """The estimate for one frame. Frames have to come in the order of time; gaps are allowed.
+
+        `pose`: the vehicle's at the frame's middle; without one, callers are followed as the body sees them.
+        """
         if frame.samples.shape != self._shape:
             raise SourceError(f"a frame of shape {frame.samples.shape} came, settings say {self._shape}")
         elapsed_s = self._hop_s if self._last_ns is None else max(frame.t_ns - self._last_ns, 0) * 1e-9
@@ -53,6 +60,7 @@ class Pipeline:
         bearing = self._locate(frame, tdoa)
         detection = self._detect(correlation, bearing, elapsed_s)
         self._locate.settle(detection.call)
+        tracks = self._track((bearing,), detection, elapsed_s, pose.attitude if pose else None)
         return Estimate(
             t_ns=frame.t_ns,
             start=frame.start,
@@ -60,7 +68,9 @@ class Pipeline:
             tdoa=tdoa,
             bearing=bearing,
             detection=detection,
-            track=self._track(bearing, detection, elapsed_s),
+            track=tracks[0] if tracks else None,
             faults=self._find_faults(frame, correlation, tdoa, bearing, elapsed_s),
             truth=frame.truth,
+            tracks=tracks,
+            pose=pose,
         )

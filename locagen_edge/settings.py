@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from locagen_edge.errors import SettingsError
-from locagen_edge.geometry import KELVIN, MicArray, equilateral, speed_of_sound
+from locagen_edge.geometry import KELVIN, MicArray, equilateral, quaternion, rotation, speed_of_sound
 
 DEFAULT_PATH = Path("/etc/locagen-edge/locagen-edge.toml")
 
@@ -75,6 +75,30 @@ class ArraySettings:
         unit="m",
         least=0,
         most=0.1,
+    )
+    delays_s: tuple[float, ...] = setting(
+        (),
+        "By how much each channel of `alsa` or `wav` is late, one number per microphone; empty: all are in "
+        "step. `locagen-edge calibrate` measures it; it is taken out before anything else hears the sound.",
+        unit="s",
+        least=-0.005,
+        most=0.005,
+    )
+    gains_db: tuple[float, ...] = setting(
+        (),
+        "By how much each channel of `alsa` or `wav` is too loud, one number per microphone; empty: all are "
+        "alike. Measured and taken out in the same way.",
+        unit="dB",
+        least=-40,
+        most=40,
+    )
+    mount_deg: tuple[float, ...] = setting(
+        (0.0, 0.0, 0.0),
+        "How the axes of array.positions_m are turned against the vehicle's: roll, pitch, yaw, as of a "
+        "vehicle that flies (yaw clockwise first, then pitch nose up, then roll right side down).",
+        unit="degrees",
+        least=-180,
+        most=180,
     )
 
 
@@ -301,8 +325,17 @@ class TrackSettings:
 
     agility_deg_s2: float = setting(
         10.0,
-        "How briskly a bearing changes its rate, per square root of a second: a drone that turns, a caller "
-        "who is passed. Less is smoother and lags more.",
+        "How briskly the drone changes its rate of turn, per square root of a second. Counts where its "
+        "attitude is not known, and bearings are followed as the body sees them. Less is smoother and lags "
+        "more.",
+        unit="degrees/s2",
+        least=0.1,
+        most=1000,
+    )
+    agility_earth_deg_s2: float = setting(
+        2.0,
+        "The same where the attitude is known, and only flying past a caller changes a bearing: 2 is for "
+        "10 m/s past a caller 30 m away.",
         unit="degrees/s2",
         least=0.1,
         most=1000,
@@ -310,6 +343,43 @@ class TrackSettings:
     coast_s: float = setting(
         2.0, "How long a track lives on after the last call.", unit="s", least=0.1, most=600
     )
+    most: int = setting(
+        4, "Callers followed at a time; beyond that the weakest gives way.", unit="callers", least=1, most=8
+    )
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """Attitude, position and height of the vehicle, as its autopilot tells them."""
+
+    rate_hz: float = setting(
+        20.0,
+        "How often the attitude is asked for (position and heights less often); 0: nothing is asked for, and "
+        "what comes anyway is used.",
+        unit="Hz", least=0, most=100,
+    )  # fmt: skip
+    attitude_limit_s: float = setting(
+        0.25,
+        "Longest time from a message to the sound that takes its attitude from it. Between two messages it "
+        "is interpolated, after the last it goes on at their rate; what is older counts as not known.",
+        unit="s", least=0.01, most=5,
+    )  # fmt: skip
+    position_limit_s: float = setting(
+        1.0, "The same for position and heights.", unit="s", least=0.01, most=60
+    )
+    compass_deg: float = setting(
+        3.0,
+        "1-sigma of the true heading, magnetic declination included. It goes into azimuths from true north; "
+        "those from the nose keep the smaller sigma.",
+        unit="degrees", least=0, most=90,
+    )  # fmt: skip
+    tilt_deg: float = setting(1.0, "The same of roll and pitch.", unit="degrees", least=0, most=90)
+    relief_m: float = setting(
+        15.0,
+        "1-sigma of the ground's height against that of the take-off place. Counts where neither "
+        "rangefinder nor terrain data tell the height over ground.",
+        unit="m", least=0, most=5000,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -379,6 +449,7 @@ class Settings:
     steered: SteeredSettings = SteeredSettings()
     detection: DetectionSettings = DetectionSettings()
     track: TrackSettings = TrackSettings()
+    pose: PoseSettings = PoseSettings()
     models: ModelsSettings = ModelsSettings()
     mavlink: MavlinkSettings = MavlinkSettings()
     daemon: DaemonSettings = DaemonSettings()
@@ -390,7 +461,8 @@ class Settings:
 
     @cached_property
     def mic_array(self) -> MicArray:
-        return MicArray(np.array(self.array.positions_m, dtype=np.float64))
+        """The microphones in the vehicle's body axes: `array.positions_m` turned by `array.mount_deg`."""
+        return _mounted(self.array)
 
     @property
     def speed_m_s(self) -> float:
@@ -399,6 +471,14 @@ class Settings:
     @property
     def hop_s(self) -> float:
         return self.audio.hop / self.audio.rate_hz
+
+
+def _mounted(array: ArraySettings) -> MicArray:
+    positions_m = np.array(array.positions_m, dtype=np.float64)
+    if not any(array.mount_deg):
+        return MicArray(positions_m)
+    roll, pitch, yaw = map(math.radians, array.mount_deg)
+    return MicArray(positions_m @ rotation(quaternion(roll, pitch, yaw)).T)
 
 
 # --- the checks ---------------------------------------------------------------------------------------
@@ -480,7 +560,16 @@ def _faults_of_array(s: Settings) -> Iterator[str]:
         return
     if not all(math.isfinite(x) for row in positions for x in row):
         return
-    array = MicArray(np.array(positions, dtype=np.float64))
+    for name in ("delays_s", "gains_db"):
+        values = getattr(s.array, name)
+        if values and len(values) != len(positions):
+            yield f"array.{name}: {len(values)} numbers for {len(positions)} microphones; one each, or none"
+    if len(s.array.mount_deg) != 3:
+        yield f"array.mount_deg: {list(s.array.mount_deg)} is not roll, pitch, yaw"
+        return
+    if not all(math.isfinite(x) for x in s.array.mount_deg):
+        return
+    array = _mounted(s.array)
     for (i, j), spacing in zip(array.pairs, array.spacing_m, strict=True):
         if spacing < 1e-3:
             yield f"{key}: microphones {i} and {j} are at the same place"
@@ -606,10 +695,13 @@ def _in_words(kind: Any) -> str:
 # --- the sample file ----------------------------------------------------------------------------------
 
 
-def sample(settings: Settings | None = None) -> str:
-    """The sample file: every section and key with its sentence, unit, range and value (or default)."""
+def sample(settings: Settings | None = None, origin: str = "What stands here are the defaults.") -> str:
+    """The sample file: every section and key with its sentence, unit, range and value (or default).
+
+    `origin`: where the values come from, in a sentence for the file's head.
+    """
     lines = [
-        "# Settings of locagen-edge. Every key may be left out; what stands here are the defaults.",
+        *_wrapped(f"Settings of locagen-edge. Every key may be left out. {origin}"),
         "# Check a changed file with: locagen-edge check --settings FILE",
     ]
     for name, section in _sections(settings or Settings()):

@@ -1,6 +1,6 @@
 """What travels along the way, in the order of travel.
 
-    Frame -> Correlation -> Tdoa -> Bearing -> Track        (Detection and faults beside them)
+    Frame -> Correlation -> Tdoa -> Bearing -> Track        (Detection, Pose and faults beside them)
 
 Each type carries its own time and rate, so that no stage has to ask another for them. All are frozen;
 arrays inside are not to be written to. Conventions of axes, signs and units: CONTRIBUTING.md.
@@ -16,6 +16,8 @@ import numpy.typing as npt
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
+Quaternion = tuple[float, float, float, float]
+"""w, x, y, z, of length 1"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,10 +132,24 @@ class Mask:
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
-    """The bearing of one caller over time, body axes."""
+class TrueBearing:
+    """A direction in earth axes. The sigmas hold the error of the vehicle's attitude, unless it is said
+    otherwise."""
 
     azimuth_rad: float
+    """clockwise from true north, -pi to pi"""
+    azimuth_sigma_rad: float
+    elevation_rad: float | None
+    """over the horizon, positive up"""
+    elevation_sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The bearing of one caller over time: as the body sees it now, and in the earth's axes."""
+
+    azimuth_rad: float
+    """body axes"""
     azimuth_sigma_rad: float
     elevation_rad: float | None
     elevation_sigma_rad: float
@@ -143,6 +159,15 @@ class Track:
     """since the call was last heard"""
     confidence: float
     """0 to 1: share of the recent frames that held a call and agreed with the track"""
+    id: int = 0
+    """the same as long as the track lives; no two tracks of a stream have the same"""
+    confirmed: bool = False
+    """heard often enough to be no chance"""
+    earth: TrueBearing | None = None
+    """None: the attitude is not known now, and the track is followed in body axes"""
+    look: TrueBearing | None = None
+    """this frame's own bearing of the caller, not smoothed, with the sigmas of its noise alone: what
+    positions are made of. None: not heard in this frame, or the attitude is not known"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +176,7 @@ class Pose:
 
     t_ns: int
     """monotonic time, as of `Frame.t_ns`"""
-    attitude: tuple[float, float, float, float] | None
+    attitude: Quaternion | None
     """unit quaternion w, x, y, z that turns vectors of the body (FRD) into those of the earth (NED): that
     of MAVLink's ATTITUDE_QUATERNION"""
     latitude_deg: float | None = None
@@ -174,9 +199,14 @@ class Estimate:
     bearing: Bearing
     detection: Detection
     track: Track | None
+    """the best of `tracks`"""
     faults: tuple[str, ...]
     """what is wrong with the microphones now, in words for the operator"""
     truth: Truth | None = None
+    tracks: tuple[Track, ...] = ()
+    """all callers, the best first"""
+    pose: Pose | None = None
+    """of the vehicle at the frame's middle"""
 
 
 Array = npt.NDArray[Any]

@@ -29,6 +29,7 @@ class Reference:
         taper: float = 0.1,
         smooth_bins: int = 6,
         loading: float = 1e-3,
+        smear: float = 0.0,
         floor: float = 1e-12,
         **_: Any,
     ) -> None:
@@ -42,7 +43,9 @@ class Reference:
         self.window = window(frame, taper)
         w2 = self.window**2
         self.looks = w2.sum() ** 2 / (frame * (w2**2).sum())
+        self.noise_looks = np.inf  # how many independent frames the noise was learnt from, times looks
         self.smooth, self.loading, self.floor = smooth_bins, loading, floor
+        self.smear, self.smear_half = smear, int(100.0 * frame / rate_hz)
 
     def bins(self, samples: np.ndarray) -> np.ndarray:
         """(mics, bins), squared magnitudes are bin powers"""
@@ -57,6 +60,13 @@ class Reference:
 
     def loaded(self, noise: np.ndarray) -> np.ndarray:
         mics = noise.shape[1]
+        around = np.array(
+            [
+                noise[max(k - self.smear_half, 0) : k + self.smear_half + 1].mean(axis=0)
+                for k in range(len(noise))
+            ]
+        )
+        noise = noise + self.smear * around
         level = np.trace(noise, axis1=1, axis2=2).real / mics + self.floor
         return noise + (self.loading * level + self.floor)[:, None, None] * np.eye(mics)
 
@@ -83,7 +93,8 @@ class Reference:
             cut = slice(middle, middle + len(q))
             q = np.convolve(q, kernel)[cut] / np.convolve(np.ones(len(q)), kernel)[cut]
         q = np.maximum(q, 1)
-        return float(self.looks * (q - 1 - np.log(q)).sum())
+        looks = 1 / (1 / self.looks + 1 / self.noise_looks)
+        return float(looks * (q - 1 - np.log(q)).sum())
 
     def at(self, signal: np.ndarray, noise: np.ndarray, azimuth: float, elevation: float) -> float:
         return self.score(signal, noise, direction(azimuth, elevation))

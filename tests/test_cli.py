@@ -60,7 +60,7 @@ def recording(tmp_path_factory) -> Path:
 # --- help and usage
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["replay"], ["devices"], ["check"]])
+@pytest.mark.parametrize("command", [[], ["run"], ["replay"], ["devices"], ["check"], ["calibrate"]])
 def test_help_is_there(command):
     done = cli(*command, "--help")
     assert done.returncode == 0

@@ -21,15 +21,16 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from peers import WITHIN_S, free_port, mavsdk
+from pymavlink.dialects.v20 import common
 from scenes import cut, heard
 
 from locagen_edge.daemon import Daemon
 from locagen_edge.errors import ModelError, SourceError, SourceHungError
-from locagen_edge.geometry import wrap
+from locagen_edge.geometry import quaternion, wrap
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.framer import Framer
 from locagen_edge.settings import Settings, from_table
-from locagen_edge.types import Frame
+from locagen_edge.types import Frame, Pose
 
 Sources = Callable[[Settings], AsyncGenerator[Frame, None]]
 
@@ -127,6 +128,66 @@ def test_sound_goes_in_and_a_bearing_comes_out(ground):
     assert any(m.get_type() == "HEARTBEAT" and m.system_status == 4 for m in arrived)
 
 
+def test_with_an_autopilot_on_the_link_the_bearing_is_from_true_north(ground):
+    """The autopilot answers what it is asked for: nose to the west, level, 20 m over the ground."""
+    settings = with_link(port_of(ground), detection={"snr_db": -20})
+    frames = steady(settings)
+    quiet = 1e-4 * np.random.default_rng(0).standard_normal((3, 1024)).astype(np.float32)
+
+    async def in_real_time(_: Settings) -> AsyncGenerator[Frame, None]:
+        for number in count():
+            samples = frames[number % len(frames)].samples if number > 10 else quiet
+            await asyncio.sleep(0.0512)
+            yield Frame(samples, 10_000.0, time.monotonic_ns() - 102_400_000, number * 512)
+
+    async def autopilot() -> None:
+        """Says what it has been asked for, and nothing before."""
+        mav, wanted, framer, client = common.MAVLink(None, 7, 1), set(), Framer(), None
+        ground.setblocking(False)
+        boot_s = time.monotonic() - 60.0
+        for tick in count():
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    data, client = ground.recvfrom(2048)
+                    decoded = [dialect.decode(packet.raw) for packet in framer.feed(data)]
+                    commands = [m for m in decoded if m.get_type() == "COMMAND_LONG"]
+                    wanted |= {m.param1 for m in commands if (m.target_system, m.command) == (7, 511)}
+                    arrived.extend(decoded)
+            ms = round((time.monotonic() - boot_s) * 1000)
+            messages = {
+                0: common.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3),
+                31: common.MAVLink_attitude_quaternion_message(
+                    ms, *quaternion(0.0, 0.0, -math.pi / 2), 0, 0, 0
+                ),
+                33: common.MAVLink_global_position_int_message(
+                    ms, 47 * 10**7, 8 * 10**7, 0, 20_000, *[0] * 4
+                ),
+            }
+            due = [m for id, m in messages.items() if id in wanted or (id == 0 and tick % 10 == 0)]
+            if client:
+                for message in due:
+                    ground.sendto(bytes(message.pack(mav)), client)
+            await asyncio.sleep(0.05)
+
+    arrived: list = []
+
+    async def test() -> None:
+        async with running(settings, sources=in_real_time) as daemon:
+            task = asyncio.create_task(autopilot())
+            try:
+                await until(lambda: daemon.component.sent["LG_AZ"] > 1)
+            finally:
+                task.cancel()
+            assert daemon.estimate is not None
+            assert daemon.estimate.pose.height_m == pytest.approx(20.0)
+            assert abs(wrap(daemon.estimate.track.azimuth_rad - 1.0)) < math.radians(2)
+
+    asyncio.run(test())
+    arrived += messages(ground)
+    values = [m.value for m in arrived if m.get_type() == "NAMED_VALUE_FLOAT" and m.name == "LG_AZ"]
+    assert values[-1] == pytest.approx(math.degrees(1.0) + 270.0, abs=2.0)
+
+
 def test_a_pipeline_that_is_too_slow_drops_the_oldest_and_counts():
     settings = with_link(9, daemon={"queue_frames": 2})
 
@@ -135,10 +196,10 @@ def test_a_pipeline_that_is_too_slow_drops_the_oldest_and_counts():
             await until(lambda: daemon.counters.estimates > 3)
             process, seen = daemon.pipeline.process, []
 
-            def slow(frame: Frame):
+            def slow(frame: Frame, pose: Pose):
                 time.sleep(0.03)
                 seen.append(frame.t_ns)
-                return process(frame)
+                return process(frame, pose)
 
             daemon.pipeline.process = slow
             await until(lambda: daemon.counters.dropped > 20)
@@ -364,7 +425,7 @@ def test_a_stuck_pipeline_is_not_taken_for_health(monkeypatch, tmp_path):
             await daemon.startup()
             await until(lambda: daemon.counters.estimates > 3)
             release = threading.Event()
-            daemon.pipeline.process = lambda _: release.wait(WITHIN_S)
+            daemon.pipeline.process = lambda *_: release.wait(WITHIN_S)
             await until(lambda: not daemon.hearing)
             with contextlib.suppress(BlockingIOError):
                 while True:

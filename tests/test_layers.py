@@ -32,6 +32,7 @@ def modules_after(statement: str) -> set[str]:
         "import locagen_edge.daemon",
         "import locagen_edge.cli",
         "import locagen_edge.check",
+        "import locagen_edge.calibrate",
         "import locagen_edge.stages.mic",
         "from locagen_edge.pipeline import Pipeline; from locagen_edge.settings import from_table; "
         "Pipeline(from_table({'denoise': {'kind': 'wave'}}))",
@@ -51,7 +52,19 @@ def test_what_is_not_used_is_not_loaded():
     assert not loaded & {"onnxruntime", "sounddevice", "soundfile", "tqdm"}
 
 
-GROUND = {"types", "geometry", "errors", "settings", "kernel", "models", "framing", "resampling", "highpass"}
+GROUND = {
+    "types",
+    "geometry",
+    "errors",
+    "settings",
+    "kernel",
+    "models",
+    "framing",
+    "resampling",
+    "alignment",
+    "files",
+    "highpass",
+}
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
     "stages": GROUND,
@@ -60,6 +73,8 @@ ABOVE = {
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
     "notify": set(),
+    "calibration": GROUND,
+    "calibrate": GROUND | {"stages", "calibration"},
     "check": GROUND | {"stages", "mavlink", "pipeline", "sources"},
     "daemon": GROUND | {"stages", "mavlink", "pipeline", "sources", "notify"},
 }

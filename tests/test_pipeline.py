@@ -24,14 +24,14 @@ from scenes import (
 
 from locagen_edge.cli import replay
 from locagen_edge.errors import SettingsError, SourceError
-from locagen_edge.geometry import wrap
+from locagen_edge.geometry import direction, quaternion, to_body, wrap
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings, from_table
 from locagen_edge.sim.calls import CALLS
 from locagen_edge.sim.levels import band_power
 from locagen_edge.sim.propagation import place
 from locagen_edge.sim.rotors import hubs_m, rotor
-from locagen_edge.types import Estimate, Frame
+from locagen_edge.types import Estimate, Frame, Pose
 
 SQUARE = [[0.055, 0.055, 0], [0.055, -0.055, 0], [-0.055, -0.055, 0], [-0.055, 0.055, 0]]
 EXACT = {"array": {"tolerance_m": 0.0}}
@@ -272,6 +272,46 @@ def test_the_sigma_of_the_steered_search_is_true():
             scores.append(abs(wrap(bearing.azimuth_rad - azimuth)) / bearing.azimuth_sigma_rad)
         assert 0.57 < np.mean(np.array(scores) < 1.0) < 0.79
         assert np.mean(np.array(scores) < 2.0) > 0.90
+
+
+# --- the vehicle's axes and the earth's
+
+
+@pytest.mark.parametrize("estimator", ["far-field", "steered"])
+@pytest.mark.parametrize("mount_deg", [[0, 0, 135], [10, -8, -60]])
+def test_bearings_are_the_vehicles_however_the_array_is_mounted(mount_deg, estimator):
+    """A tilted array has two answers below the horizon, so its caller is far below."""
+    settings = from_table({"array": {"mount_deg": mount_deg}, "bearing": {"estimator": estimator}})
+    sound = heard(settings, 1.0, -0.9, 20.0, 4096)
+    bearing = process(settings, after_noise(settings, sound, 20.0, 80))[-1].bearing
+    off = direction(bearing.azimuth_rad, bearing.elevation_rad) - direction(1.0, -0.9)
+    assert math.degrees(np.linalg.norm(off)) < 3.0
+
+
+@pytest.mark.parametrize("rate_deg_s", [0.0, 45.0, -60.0])
+def test_a_caller_stands_still_in_the_earths_axes_under_a_drone_that_turns(rate_deg_s):
+    """White sound from 200 degrees true, 30 below the horizon; the drone leans 6 degrees into its turn."""
+    settings = from_table({"detection": {"snr_db": -20}, "pose": {"compass_deg": 0, "tilt_deg": 0}})
+    pipeline, caller = Pipeline(settings), (math.radians(200.0), math.radians(-30.0))
+    quiet = 1e-3 * np.random.default_rng(0).standard_normal((3, 40_000)).astype(np.float32)
+    for frame in cut(settings, quiet):
+        pipeline.process(frame)
+    offs, seen = [], []
+    for number in range(80):
+        t_ns = 4_000_000_000 + number * 51_200_000
+        attitude = quaternion(0.1, 0.05, math.radians(rate_deg_s) * number * settings.hop_s)
+        here = to_body(attitude, *caller)
+        frame = Frame(heard(settings, *here, 20.0, 1024, seed=number), 10_000.0, t_ns, number * 512)
+        estimate = pipeline.process(frame, Pose(t_ns + 51_200_000, attitude))
+        assert estimate.pose.attitude == attitude
+        if number >= 20:
+            offs.append(math.degrees(wrap(estimate.track.earth.azimuth_rad - caller[0])))
+            seen.append(math.degrees(wrap(estimate.track.azimuth_rad - here[0])))
+    assert {track.id for track in estimate.tracks if track.confirmed} == {1}
+    assert np.abs(offs).max() < 2.0
+    assert np.abs(seen).max() < 2.0
+    assert abs(np.mean(offs)) < 0.3  # 60 degrees/s and 10 ms of lag would be 0.6
+    assert estimate.track.earth.elevation_rad == pytest.approx(caller[1], abs=math.radians(2))
 
 
 # --- bad input

@@ -69,6 +69,9 @@ BAD = {
         "correlation.band_hz: [300.0, 320.0]",
     ),
     "two coordinates": ({"array": {"positions_m": [[0, 0], [0, 1], [1, 0]]}}, "array.positions_m: every row"),
+    "mount": ({"array": {"mount_deg": [0, 90]}}, "array.mount_deg: [0.0, 90.0] is not roll, pitch, yaw"),
+    "mount on its side": ({"array": {"mount_deg": [90, 0, 0]}}, "array.positions_m: seen from above"),
+    "mount of no number": ({"array": {"mount_deg": [0, 0, float("nan")]}}, "array.mount_deg: nan"),
     "one microphone": (
         {"array": {"positions_m": [[0, 0, 0]]}, "audio": {"channel_map": [0]}},
         "array.positions_m: 1 microphones; 2 to 8",
@@ -88,6 +91,9 @@ BAD = {
         },
         "daemon.stall_s: 0.5 s is less than two hops",
     ),
+    "delays for others": ({"array": {"delays_s": [0, 1e-5]}}, "array.delays_s: 2 numbers for 3 microphones"),
+    "gains for others": ({"array": {"gains_db": [1]}}, "array.gains_db: 1 numbers for 3 microphones"),
+    "later than can be": ({"array": {"delays_s": [0, 0, 1]}}, "array.delays_s: 1.0 s is outside"),
     "upright pair": (
         {
             "array": {"positions_m": [[0, 0, 0], [0, 0, 0.1]]},
@@ -181,3 +187,13 @@ def test_unreadable_files_are_told_in_one_line(tmp_path, content, says):
         load(path)
     assert len(str(caught.value).splitlines()) == 1
     assert str(path) in str(caught.value)
+
+
+def test_a_mounted_array_is_where_the_vehicle_has_it():
+    """Turned a quarter clockwise, what the array has ahead is on the right; leaning back, it is up."""
+    ahead = [[0.1, 0, 0], [0, 0.1, 0], [0, -0.1, 0]]
+    clockwise = from_table({"array": {"positions_m": ahead, "mount_deg": [0, 0, 90]}}).mic_array
+    assert clockwise.positions_m[0] == pytest.approx([0.0, 0.1, 0.0])
+    assert clockwise.positions_m[1] == pytest.approx([-0.1, 0.0, 0.0])
+    back = from_table({"array": {"positions_m": ahead, "mount_deg": [0, 30, 0]}}).mic_array
+    assert back.positions_m[0] == pytest.approx([0.0866, 0.0, -0.05], abs=1e-4)

@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 
 from locagen_edge.errors import LocagenError, SettingsError
+from locagen_edge.files import write
 from locagen_edge.lab import dataset_cli
 from locagen_edge.lab.denoise import cli as denoise_cli
-from locagen_edge.lab.files import write
 from locagen_edge.lab.settings import OWN, PAPER, read
 
 

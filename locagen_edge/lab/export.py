@@ -18,7 +18,7 @@ import onnx
 import onnxruntime
 import torch
 
-from locagen_edge.lab.files import write
+from locagen_edge.files import write
 from locagen_edge.models import MANIFEST
 from locagen_edge.types import F32
 

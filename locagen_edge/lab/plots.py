@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
-from locagen_edge.lab.files import replacing
+from locagen_edge.files import replacing
 
 Drawing = Callable[[Axes, dict[str, Any]], None]
 

@@ -36,7 +36,7 @@ TEMPORARY = ".part"
 Metadata = dict[str, str]
 
 MATTERS: dict[str, tuple[str, ...]] = {
-    "array": ("positions_m",),
+    "array": ("positions_m", "mount_deg"),
     "environment": (),
     "audio": ("rate_hz", "frame", "hop"),
     "correlation": (),

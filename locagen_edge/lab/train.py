@@ -20,10 +20,10 @@ import torch
 from tqdm import tqdm
 
 from locagen_edge.errors import ModelError, SettingsError
+from locagen_edge.files import write
 from locagen_edge.lab.dataset import make, open_dataset
 from locagen_edge.lab.export import answers_of, install
 from locagen_edge.lab.features import normalised
-from locagen_edge.lab.files import write
 from locagen_edge.lab.methods import METHODS, Trained, train
 from locagen_edge.lab.samples import NAMES, at_snr, best_deg, draw, heard, mean_error_deg, of_columns
 from locagen_edge.lab.settings import LabSettings

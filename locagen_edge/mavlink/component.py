@@ -7,13 +7,15 @@ The profile, for any ground station and autopilot as they are:
   companion as a lost one. `system_status` is ACTIVE, or CRITICAL with a microphone fault: "not normal, but
   can still work" is what MAV_STATE_CRITICAL means, and bearings go on with what is left.
   Never system id 255: a ground station's failsafe hangs on that one.
-- NAMED_VALUE_FLOAT while a track lives, all of one moment with one time: LG_AZB (degrees clockwise from
-  the nose, 0 to 360), LG_AZ (from true north, where the heading is known), LG_EL (degrees above the
-  horizon of the body; left out where the array cannot tell), LG_SIG (1-sigma of the azimuth, degrees),
-  LG_CONF (0 to 1), LG_SNR (dB, in-band).
+- NAMED_VALUE_FLOAT while a track lives, all of one moment with one time, for the best track: LG_AZB (degrees
+  clockwise from the nose, 0 to 360), LG_AZ (from true north, where the attitude is known), LG_EL (degrees
+  above the horizon, or that of the body where the attitude is not known; left out where the array cannot
+  tell), LG_SIG (1-sigma of the azimuth, degrees: of LG_AZ where it is sent, compass and all), LG_CONF (0 to
+  1), LG_SNR (dB, in-band).
 - STATUSTEXT once per confirmed call, once per fault and once when a fault has gone.
+- COMMAND_LONG to the autopilot, to have its attitude and position sent: never any other command.
 
-ArduPilot forwards these three between its links and writes the last two into its log. Times are monotonic
+ArduPilot forwards the first three between its links and writes the last two into its log. Times are monotonic
 seconds. Call `due` only while the link is up, and `say_again` when it has come up: then nothing that
 holds is said to nobody.
 """
@@ -30,7 +32,9 @@ from typing import Any
 from locagen_edge.geometry import compass_deg
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.framer import Framer, Packet
-from locagen_edge.settings import MavlinkSettings
+from locagen_edge.mavlink.pose import READ, PoseHistory
+from locagen_edge.mavlink.streams import Streams
+from locagen_edge.settings import MavlinkSettings, PoseSettings
 from locagen_edge.types import Track
 
 HEARTBEAT_S = 1.0
@@ -44,6 +48,8 @@ FAULT_GONE_S = 5.0
 """a fault has gone when it stayed away this long: one that flickers is told once, not each time"""
 TEXT_S = 0.5
 """least mean distance of two texts: a radio link at 57600 baud and a reader's eye both bear it"""
+CALLS_REMEMBERED = 16
+"""tracks of which the operator was told; more than can be followed at a time"""
 TEXTS_WAITING = 8
 """texts that may wait, 4 s of them; beyond that the newest is dropped and counted"""
 
@@ -61,8 +67,8 @@ class Status:
     snr_db: float
     faults: tuple[str, ...]
     """what is wrong now, in words for the operator; the same fault always in the same words"""
-    heading_rad: float | None = None
-    """true heading of the nose, clockwise from north; None: not known"""
+    others: tuple[Track, ...] = ()
+    """callers beside `track`; the operator is told of each, values are sent of `track` alone"""
 
 
 class Component:
@@ -72,7 +78,9 @@ class Component:
     the computer's boot, which is what the field is called.
     """
 
-    def __init__(self, settings: MavlinkSettings, start_s: float = 0.0) -> None:
+    def __init__(
+        self, settings: MavlinkSettings, start_s: float = 0.0, pose: PoseSettings | None = None
+    ) -> None:
         self._fixed_id = settings.system_id
         self._start_s = start_s
         self._framer = Framer()
@@ -82,8 +90,11 @@ class Component:
         self._text = _Every(TEXT_S)
         self._texts: deque[tuple[int, str]] = deque()
         self._faults: dict[str, float] = {}  # told, and when each was last there
-        self._call_told = False
-        self._call_age_s = 0.0
+        self._told: deque[int] = deque(maxlen=CALLS_REMEMBERED)
+        pose = pose or PoseSettings()
+        self._streams = Streams(pose.rate_hz)
+        self.poses = PoseHistory(pose)
+        """where the vehicle was, as its autopilot tells"""
         self.autopilot_heard_s: float | None = None
         """when the autopilot's last heartbeat came"""
         self.sent: Counter[str] = Counter()
@@ -108,6 +119,8 @@ class Component:
         for packet in self._framer.feed(data):
             if packet.message_id == dialect.HEARTBEAT and _is_autopilot(packet):
                 self._hear_autopilot(packet.system_id, now_s)
+            elif packet.message_id in READ:
+                self._hear_pose(packet, now_s)
 
     def _hear_autopilot(self, system_id: int, now_s: float) -> None:
         if system_id != (self._fixed_id or self.system_id):
@@ -116,6 +129,17 @@ class Component:
                 return  # another vehicle on the same network
             self._sender.system_id = system_id
         self.autopilot_heard_s = now_s
+        self._streams.hear_heartbeat(now_s)
+
+    def _hear_pose(self, packet: Packet, now_s: float) -> None:
+        """A message about the vehicle, from the autopilot whose heartbeat we follow."""
+        if packet.component_id != dialect.COMPONENT_AUTOPILOT or packet.system_id != self.system_id:
+            return
+        reboots = self.poses.reboots
+        self.poses.take(dialect.decode(packet.raw), round(now_s * 1e9))
+        self._streams.hear_message(packet.message_id, now_s)
+        if self.poses.reboots > reboots:
+            self._streams.ask_all()
 
     # --- out ------------------------------------------------------------------------------------------
 
@@ -130,17 +154,19 @@ class Component:
         """The link has come up: tell again what holds now, to whoever is there now."""
         self._texts.clear()
         self._faults.clear()
-        self._call_told = False
+        self._told.clear()
 
     def _messages(self, now_s: float, status: Status) -> Iterator[tuple[str, Any]]:
         if status.hearing and self._heartbeat.due(now_s):
             state = dialect.STATE_CRITICAL if status.faults else dialect.STATE_ACTIVE
             yield "HEARTBEAT", dialect.heartbeat(state)
+        if status.hearing and (wanted := self._streams.due(now_s)) is not None:
+            yield "COMMAND_LONG", dialect.set_message_interval(self.system_id, *wanted)
         if self._texts and self._text.due(now_s):
             yield "STATUSTEXT", dialect.statustext(*self._texts.popleft())
         if status.hearing and status.track and self._values.due(now_s):
             time_boot_ms = round((now_s - self._start_s) * 1000)
-            for name, value in bearing_values(status.track, status.snr_db, status.heading_rad):
+            for name, value in bearing_values(status.track, status.snr_db):
                 yield name, dialect.named_value_float(time_boot_ms, name, value)
 
     def _pack(self, name: str, message: Any) -> bytes:
@@ -148,13 +174,10 @@ class Component:
         return self._sender.pack(message)
 
     def _follow_call(self, status: Status) -> None:
-        track = status.track
-        if track is None or track.age_s < self._call_age_s:
-            self._call_told = False  # it died, or another one was born in its place
-        self._call_age_s = track.age_s if track else 0.0
-        if track and not self._call_told and is_confirmed(track):
-            self._call_told = True
-            self._say(dialect.SEVERITY_NOTICE, call_text(track, status.heading_rad), first=True)
+        for track in (status.track, *status.others):
+            if track and track.id not in self._told and is_confirmed(track):
+                self._told.append(track.id)
+                self._say(dialect.SEVERITY_NOTICE, call_text(track), first=True)
 
     def _follow_faults(self, now_s: float, faults: tuple[str, ...]) -> None:
         for fault in faults:
@@ -185,34 +208,33 @@ def is_confirmed(track: Track) -> bool:
     )
 
 
-def bearing_values(track: Track, snr_db: float, heading_rad: float | None) -> Iterator[tuple[str, float]]:
+def bearing_values(track: Track, snr_db: float) -> Iterator[tuple[str, float]]:
     """Names and values of a bearing, clamped to their range; what is not a number is left out.
 
     An infinite sigma is the most there is, 180 degrees: a missing value would leave the last good one on
     the ground station's screen.
     """
+    shown = track.earth or track
     yield from _value("LG_AZB", compass_deg(track.azimuth_rad), 0, 360)
-    yield from _value("LG_AZ", _true_deg(track, heading_rad), 0, 360)
-    if track.elevation_rad is not None:
-        yield from _value("LG_EL", math.degrees(track.elevation_rad), -90, 90)
-    yield from _value("LG_SIG", math.degrees(track.azimuth_sigma_rad), 0, 180)
+    if track.earth is not None:
+        yield from _value("LG_AZ", compass_deg(track.earth.azimuth_rad), 0, 360)
+    if shown.elevation_rad is not None:
+        yield from _value("LG_EL", math.degrees(shown.elevation_rad), -90, 90)
+    yield from _value("LG_SIG", math.degrees(shown.azimuth_sigma_rad), 0, 180)
     yield from _value("LG_CONF", track.confidence, 0, 1)
     yield from _value("LG_SNR", snr_db, -200, 200)
 
 
-def call_text(track: Track, heading_rad: float | None) -> str:
+def call_text(track: Track) -> str:
     """One line for the operator, at most 50 characters: where a confirmed call comes from, with 1-sigma."""
-    body, true = _whole(compass_deg(track.azimuth_rad)), _true_deg(track, heading_rad)
-    where = f"{body} deg clockwise from nose"
-    if not math.isnan(true):
-        where = f"{_whole(true)} deg true, {body} from nose"
-    sigma = math.degrees(track.azimuth_sigma_rad)
+    body = _whole(compass_deg(track.azimuth_rad))
+    where, sigma = f"{body} deg clockwise from nose", math.degrees(track.azimuth_sigma_rad)
+    if track.earth is not None and not math.isnan(true := compass_deg(track.earth.azimuth_rad)):
+        where, sigma = (
+            f"{_whole(true)} deg true, {body} from nose",
+            math.degrees(track.earth.azimuth_sigma_rad),
+        )
     return f"Call heard: {where}" + (f", +-{max(1, round(sigma))} deg" if 0 <= sigma <= 180 else "")
-
-
-def _true_deg(track: Track, heading_rad: float | None) -> float:
-    """Azimuth from true north, [0, 360); NaN where the heading is not known."""
-    return math.nan if heading_rad is None else compass_deg(track.azimuth_rad + heading_rad)
 
 
 def _whole(degrees: float) -> str:

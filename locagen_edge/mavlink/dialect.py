@@ -1,7 +1,7 @@
 """The one place that names the generated dialect, and the messages that we send.
 
 `common` as pymavlink ships it: importing it takes 65 ms and 20.5 MB and pulls in no `mavutil`, which
-blocks. Only `Sender` and the three functions below make messages: an id that has no function here never
+blocks. Only `Sender` and the four functions below make messages: an id that has no function here never
 leaves. Some ids act on flight when a companion sends them (LANDING_TARGET, OBSTACLE_DISTANCE,
 FOLLOW_TARGET, RADIO_STATUS and others); none of them has a place in this file.
 """
@@ -83,6 +83,23 @@ def statustext(severity: int, text: str) -> Any:
     """STATUSTEXT in printable ASCII, cut at 50 bytes: what else the text holds becomes a question mark."""
     plain = "".join(c if " " <= c <= "~" else "?" for c in text[:TEXT_BYTES])
     return common.MAVLink_statustext_message(severity, plain.encode("ascii"))
+
+
+def set_message_interval(system_id: int, message_id: int, interval_us: int) -> Any:
+    """The command to an autopilot to send us a message this often: the only command that we give."""
+    return common.MAVLink_command_long_message(
+        target_system=system_id,
+        target_component=COMPONENT_AUTOPILOT,
+        command=common.MAV_CMD_SET_MESSAGE_INTERVAL,
+        confirmation=0,
+        param1=float(message_id),
+        param2=float(interval_us),
+        param3=0.0,
+        param4=0.0,
+        param5=0.0,
+        param6=0.0,
+        param7=0.0,  # to whom: as the autopilot does by itself, on the link on which it was asked
+    )
 
 
 class Sender:

@@ -27,6 +27,7 @@ from typing import Protocol
 import numpy as np
 import soundfile
 
+from locagen_edge.alignment import Aligner
 from locagen_edge.errors import SourceError, SourceHungError
 from locagen_edge.framing import Framer, in_real_time
 from locagen_edge.resampling import Resampler
@@ -47,12 +48,14 @@ _hung: threading.Thread | None = None  # a reading thread that did not come back
 
 
 class _Cutter:
-    """Rows as a device or file delivers them, into frames: channels chosen, resampled, turned, cut."""
+    """Rows as a device or file gives them, into frames: channels chosen, resampled, aligned, turned, cut."""
 
     def __init__(self, settings: Settings, rate_in: float) -> None:
         audio = settings.audio
         self._map = list(audio.channel_map)
         self._resampler = Resampler(rate_in, audio.rate_hz, len(self._map))
+        array = settings.array
+        self._aligner = Aligner(array.delays_s, array.gains_db, audio.rate_hz, len(self._map))
         self.framer = Framer(audio.frame, audio.hop, len(self._map), audio.rate_hz)
 
     def push(self, rows: Array, *, last: bool = False) -> list[Frame]:
@@ -60,11 +63,15 @@ class _Cutter:
         chosen = rows[:, self._map].astype(np.float32)
         if rows.dtype == np.int16:
             chosen /= 32768.0  # full scale 1.0
-        ready = self._resampler.flush(chosen) if last else self._resampler.push(chosen)
+        if last:
+            ready = self._aligner.flush(self._resampler.flush(chosen))
+        else:
+            ready = self._aligner.push(self._resampler.push(chosen))
         return self.framer.push(ready.T)
 
     def gap(self, overruns: int = 1) -> None:
         self._resampler.clear()
+        self._aligner.clear()
         self.framer.gap(overruns)
 
 

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import common
 from locagen_edge.mavlink import component as voice
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.settings import MavlinkSettings
-from locagen_edge.types import Track
+from locagen_edge.types import Track, TrueBearing
 
 TICK_S = 0.0512  # the pipeline's hop
 TRACK = Track(
@@ -29,6 +29,9 @@ TRACK = Track(
     age_s=0.6,
     silent_s=0.0,
     confidence=0.9,
+)
+IN_EARTH = replace(
+    TRACK, earth=TrueBearing(math.radians(12.0), math.radians(4.25), math.radians(-25.0), math.radians(5.5))
 )
 QUIET = Status(hearing=True, track=None, snr_db=-3.0, faults=())
 CALLING = replace(QUIET, track=TRACK, snr_db=6.0)
@@ -192,8 +195,8 @@ def test_a_new_track_is_sent_at_once() -> None:
 
 
 def test_values_are_what_the_track_says() -> None:
-    got = values(said(Component(MavlinkSettings()), replace(CALLING, heading_rad=math.radians(330)), 1))
-    wanted = {"LG_AZB": 42.0, "LG_AZ": 12.0, "LG_EL": -20.0, "LG_SIG": 3.0, "LG_CONF": 0.9, "LG_SNR": 6.0}
+    got = values(said(Component(MavlinkSettings()), replace(CALLING, track=IN_EARTH), 1))
+    wanted = {"LG_AZB": 42.0, "LG_AZ": 12.0, "LG_EL": -25.0, "LG_SIG": 4.25, "LG_CONF": 0.9, "LG_SNR": 6.0}
     assert got == pytest.approx(wanted, rel=1e-6)  # float32
 
 
@@ -222,7 +225,8 @@ def test_what_is_not_known_is_not_sent() -> None:
     ],
 )
 def test_azimuth_is_from_0_to_below_360(azimuth_rad: float, degrees: float) -> None:
-    status = replace(CALLING, track=replace(TRACK, azimuth_rad=azimuth_rad), heading_rad=0.0)
+    earth = TrueBearing(azimuth_rad, 0.1, None, 0.1)
+    status = replace(CALLING, track=replace(TRACK, azimuth_rad=azimuth_rad, earth=earth))
     got = values(said(Component(MavlinkSettings()), status, 1))
     for name in ("LG_AZB", "LG_AZ"):
         assert got[name] == pytest.approx(degrees, abs=1e-4)
@@ -231,19 +235,20 @@ def test_azimuth_is_from_0_to_below_360(azimuth_rad: float, degrees: float) -> N
 
 
 ANY = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf, -0.0, 1e308, 5e-324])
+IN_ANY_EARTH = st.none() | st.builds(TrueBearing, ANY, ANY, st.none() | ANY, ANY)
 
 
-@given(ANY, ANY, ANY | st.none(), ANY, ANY, ANY | st.none())
+@given(ANY, ANY, ANY | st.none(), ANY, ANY, IN_ANY_EARTH)
 def test_no_number_raises_or_leaves_its_range(
     azimuth: float,
     sigma: float,
     elevation: float | None,
     confidence: float,
     snr: float,
-    heading: float | None,
+    earth: TrueBearing | None,
 ) -> None:
-    track = Track(azimuth, sigma, elevation, 0.1, 1.0, 0.0, confidence)
-    status = Status(True, track, snr, (), heading)
+    track = Track(azimuth, sigma, elevation, 0.1, 1.0, 0.0, confidence, earth=earth)
+    status = Status(True, track, snr, ())
     got = values(said(Component(MavlinkSettings(), start_s=-1e6), status, 0.2))
     limits = {"LG_AZB": 360, "LG_AZ": 360, "LG_EL": 90, "LG_SIG": 180, "LG_CONF": 1, "LG_SNR": 200}
     assert all(abs(value) <= limits[name] for name, value in got.items())  # NaN would fail too
@@ -277,11 +282,23 @@ def test_a_confirmed_call_is_told_once() -> None:
     ]
 
 
-def test_with_a_heading_the_true_bearing_comes_first() -> None:
-    status = replace(CALLING, heading_rad=math.radians(330))
-    assert texts(said(Component(MavlinkSettings()), status, 1)) == [
-        "Call heard: 012 deg true, 042 from nose, +-3 deg"
+def test_with_an_attitude_the_true_bearing_comes_first() -> None:
+    assert texts(said(Component(MavlinkSettings()), replace(CALLING, track=IN_EARTH), 1)) == [
+        "Call heard: 012 deg true, 042 from nose, +-4 deg"
     ]
+
+
+def test_each_of_several_callers_is_told_once_whichever_is_the_best() -> None:
+    component = Component(MavlinkSettings())
+    second = replace(TRACK, id=2, azimuth_rad=math.radians(200.0))
+    both = replace(CALLING, others=(second,))
+    swapped = replace(CALLING, track=second, others=(TRACK,))
+    assert sorted(texts(said(component, both, 3))) == [
+        "Call heard: 042 deg clockwise from nose, +-3 deg",
+        "Call heard: 200 deg clockwise from nose, +-3 deg",
+    ]
+    assert texts(said(component, swapped, 3, 3.0)) == []
+    assert values(said(component, swapped, 1, 6.0))["LG_AZB"] == pytest.approx(200.0)
 
 
 @pytest.mark.parametrize("weak", [{"confidence": 0.49}, {"age_s": 0.29}, {"confidence": math.nan}])
@@ -298,9 +315,9 @@ def test_a_call_born_again_is_told_again() -> None:
         (0.0, CALLING, 1),
         (2.0, later, 0),  # the same one goes on
         (4.0, QUIET, 0),
-        (6.0, CALLING, 1),  # died and came back
-        (8.0, later, 0),
-        (10.0, CALLING, 1),  # younger than it was: another one took its place
+        (6.0, CALLING, 0),  # the same one still
+        (8.0, replace(CALLING, track=replace(TRACK, id=1)), 1),  # another one took its place
+        (10.0, later, 0),
     ):
         assert len(texts(said(component, status, 2, start_s))) == told
 
@@ -382,9 +399,10 @@ def test_any_text_fits_and_stays_readable(words: str) -> None:
 
 
 @given(st.floats(-10, 10), st.floats(0, 1e9) | st.just(math.nan), st.floats(-10, 10) | st.none())
-def test_a_calls_text_is_never_cut(azimuth: float, sigma: float, heading: float | None) -> None:
-    track = replace(TRACK, azimuth_rad=azimuth, azimuth_sigma_rad=sigma)
-    assert len(voice.call_text(track, heading)) <= 50
+def test_a_calls_text_is_never_cut(azimuth: float, sigma: float, true: float | None) -> None:
+    earth = None if true is None else TrueBearing(true, sigma, None, sigma)
+    track = replace(TRACK, azimuth_rad=azimuth, azimuth_sigma_rad=sigma, earth=earth)
+    assert len(voice.call_text(track)) <= 50
 
 
 # --- all of it ----------------------------------------------------------------------------------------
@@ -392,21 +410,23 @@ def test_a_calls_text_is_never_cut(azimuth: float, sigma: float, heading: float 
 STATUSES = st.builds(
     Status,
     hearing=st.booleans(),
-    track=st.none() | st.builds(Track, ANY, ANY, st.none() | ANY, ANY, ANY, ANY, ANY),
+    track=st.none()
+    | st.builds(Track, ANY, ANY, st.none() | ANY, ANY, ANY, ANY, ANY, st.integers(), earth=IN_ANY_EARTH),
     snr_db=ANY,
     faults=st.lists(st.text(), max_size=3).map(tuple),
-    heading_rad=st.none() | ANY,
 )
 
 
 @given(st.lists(STATUSES, max_size=30), st.binary(max_size=300))
-def test_only_three_messages_ever_leave(statuses: list[Status], noise: bytes) -> None:
+def test_only_four_messages_ever_leave(statuses: list[Status], noise: bytes) -> None:
     component = Component(MavlinkSettings())
     ids: Counter[int] = Counter()
     for k, status in enumerate(statuses):
-        component.receive(noise, k * 0.4)
-        ids.update(m.get_msgId() for m in decode(component.due(k * 0.4, status)))
-    assert set(ids) <= {0, 251, 253}
+        component.receive(noise + heartbeat(7), k * 0.4)
+        messages = decode(component.due(k * 0.4, status))
+        ids.update(m.get_msgId() for m in messages)
+        assert all(m.command == 511 for m in messages if m.get_msgId() == 76)  # SET_MESSAGE_INTERVAL
+    assert set(ids) <= {0, 76, 251, 253}
     assert sum(ids.values()) == sum(component.sent.values())
 
 

@@ -17,7 +17,7 @@ from peers import WITHIN_S, Peer, free_port, mavsdk
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.link import Link, parse
 from locagen_edge.settings import MavlinkSettings
-from locagen_edge.types import Track
+from locagen_edge.types import Track, TrueBearing
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("mavsdk") is None, reason="needs the mavsdk package (extra: dev)"
@@ -26,10 +26,18 @@ pytestmark = pytest.mark.skipif(
 QUIET = Status(hearing=True, track=None, snr_db=0.0, faults=())
 CALLING = Status(
     hearing=True,
-    track=Track(math.radians(-72.25), math.radians(3.25), math.radians(-20.0), 0.1, 0.6, 0.0, 0.875),
+    track=Track(
+        math.radians(-72.25),
+        math.radians(2.0),
+        math.radians(-10.0),
+        0.1,
+        0.6,
+        0.0,
+        0.875,
+        earth=TrueBearing(math.radians(27.75), math.radians(3.25), math.radians(-20.0), 0.1),
+    ),
     snr_db=6.5,
     faults=(),
-    heading_rad=math.radians(100.0),
 )
 WANTED = {"LG_AZB": 287.75, "LG_AZ": 27.75, "LG_EL": -20.0, "LG_SIG": 3.25, "LG_CONF": 0.875, "LG_SNR": 6.5}
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from locagen_edge.errors import DatasetError
-from locagen_edge.lab.files import write
+from locagen_edge.files import write
 from locagen_edge.lab.settings import LabSettings, read
 from locagen_edge.settings import sample
 

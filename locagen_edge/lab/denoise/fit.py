@@ -18,9 +18,9 @@ import torch
 from tqdm import tqdm
 
 from locagen_edge.errors import DatasetError
+from locagen_edge.files import replacing, write
 from locagen_edge.lab.denoise.mixes import Batch, Mixer
 from locagen_edge.lab.denoise.sounds import corpus
-from locagen_edge.lab.files import replacing, write
 from locagen_edge.lab.nets.mask import LOOKAHEAD, MaskNet
 from locagen_edge.lab.nets.wave import STRIDE, WaveNet
 from locagen_edge.lab.settings import FitSettings, LabSettings, MaskSettings, WaveSettings

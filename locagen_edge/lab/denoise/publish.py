@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from locagen_edge.errors import ModelError
+from locagen_edge.files import replacing
 from locagen_edge.lab.export import install, to_onnx_with_states
-from locagen_edge.lab.files import replacing
 from locagen_edge.lab.nets.mask import BINS, MaskNet
 from locagen_edge.lab.nets.wave import WaveNet
 from locagen_edge.lab.settings import LabSettings

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from locagen_edge.files import write
 from locagen_edge.lab.denoise.evaluate import CLASS_SNRS_DB, HELP
 from locagen_edge.lab.denoise.peers import spectra_of
-from locagen_edge.lab.files import write
 from locagen_edge.lab.plots import draw
 from locagen_edge.stages.denoise import RATE_HZ
 

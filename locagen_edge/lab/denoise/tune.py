@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from locagen_edge.errors import DatasetError
+from locagen_edge.files import write
 from locagen_edge.lab.denoise.cases import Case, case
 from locagen_edge.lab.denoise.evaluate import CLASS_SNRS_DB, mask_method, run_cases
 from locagen_edge.lab.denoise.fit import fit
@@ -17,7 +18,6 @@ from locagen_edge.lab.denoise.mixes import Mixer
 from locagen_edge.lab.denoise.peers import Method, wiener
 from locagen_edge.lab.denoise.publish import models_in, publish, weights_of
 from locagen_edge.lab.denoise.sounds import Corpus, corpus, high_passed, own_parts
-from locagen_edge.lab.files import write
 from locagen_edge.lab.recordings import load, read_sound
 from locagen_edge.lab.settings import LabSettings
 from locagen_edge.models import directory_of

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from locagen_edge.geometry import angles, wrap
+from locagen_edge.geometry import FLAT_M, angles, wrap
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import (
     LARGEST_AZIMUTH_SIGMA_RAD,
@@ -28,9 +28,6 @@ from locagen_edge.stages.bearing.common import (
     no_bearing,
 )
 from locagen_edge.types import F64, Bearing, Tdoa
-
-FLAT_M = 1e-4
-"""Thinner than this an array is flat: 0.1 mm is 0.3 us, a tenth of what a frame's noise leaves."""
 
 ALIKE = 16.0
 """Two answers count as alike where their squared misfits differ by less, per independent delay: 4 sigma, so
