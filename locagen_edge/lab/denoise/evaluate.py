@@ -24,7 +24,7 @@ from locagen_edge.models import load_network
 from locagen_edge.stages.denoise import CHUNK, MASK_DELAY, WAVE_DELAY, MaskStream, WaveStream
 from locagen_edge.types import F32
 
-SNRS_DB = (-30.0, -25.0, -20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0)
+SNRS_DB = (-30.0, -20.0, -10.0, -5.0, 0.0, 5.0, 10.0)
 HELP = ("crying_baby", "door_knock", "scream", "speech", "whistle")
 """classes that call for help; music and clapping are judged, but apart"""
 CLASS_SNRS_DB = (-5.0, 0.0, 5.0)
