@@ -12,6 +12,7 @@ from locagen_edge.geometry import tolerance_rad
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing import make_locator
 from locagen_edge.stages.correlation import Correlator
+from locagen_edge.stages.denoise import WaveDenoiser
 from locagen_edge.stages.detection import Detector
 from locagen_edge.stages.faults import FaultFinder
 from locagen_edge.stages.position import Positioner, sighting
@@ -31,6 +32,7 @@ class Pipeline:
         shape = (array, settings.speed_m_s, float(audio.rate_hz), audio.frame, settings.correlation)
         self._shape = (array.mics, audio.frame)
         self._hop_s = settings.hop_s
+        self._denoise = WaveDenoiser(settings) if settings.denoise.kind == "wave" else None
         self._correlate = Correlator(*shape)
         self._pick = PeakPicker(*shape)
         self._locate = make_locator(settings)
@@ -59,6 +61,8 @@ class Pipeline:
             raise SourceError(f"a frame of shape {frame.samples.shape} came, settings say {self._shape}")
         elapsed_s = self._hop_s if self._last_ns is None else max(frame.t_ns - self._last_ns, 0) * 1e-9
         self._last_ns = frame.t_ns
+        if self._denoise is not None:
+            frame = self._denoise(frame)
         correlation = self._correlate(frame)
         tdoa = self._pick(correlation)
         bearings = self._locate(frame, tdoa, elapsed_s)

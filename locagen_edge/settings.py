@@ -200,6 +200,32 @@ class SimSettings:
 
 
 @dataclass(frozen=True)
+class DenoiseSettings:
+    """Taking the rotors out of the sound, by networks that know them."""
+
+    kind: str = setting(
+        "none",
+        "`wave`: every microphone's sound goes through the paper's network before it is correlated, and "
+        "comes "
+        "6 ms later. `mask`: the sound stays as it is, and a mask says which frequencies are the caller's.",
+        choices=("none", "wave", "mask"),
+    )
+    wave: str = setting("denoise-wave", "The model of `wave`.", pattern=NAME)
+    mask: str = setting(
+        "denoise-mask",
+        "The model of `mask`; `locagen-lab denoise tune` makes one for your drone.",
+        pattern=NAME,
+    )
+    forget_s: float = setting(
+        4.0,
+        "How fast the spectrum of the noise is learnt and forgotten, while nothing calls.",
+        unit="s",
+        least=0.2,
+        most=600,
+    )
+
+
+@dataclass(frozen=True)
 class CorrelationSettings:
     """GCC-PHAT of all pairs."""
 
@@ -597,6 +623,7 @@ class Settings:
     environment: EnvironmentSettings = EnvironmentSettings()
     audio: AudioSettings = AudioSettings()
     sim: SimSettings = SimSettings()
+    denoise: DenoiseSettings = DenoiseSettings()
     correlation: CorrelationSettings = CorrelationSettings()
     bearing: BearingSettings = BearingSettings()
     steered: SteeredSettings = SteeredSettings()
@@ -698,6 +725,7 @@ def _faults_between_fields(s: Settings) -> Iterator[str]:
             f"audio.channel_map: {len(s.audio.channel_map)} channels, "
             f"but array.positions_m has {len(s.array.positions_m)} microphones"
         )
+    yield from _faults_of_denoiser(s)
     if s.audio.source == "alsa" and max(s.audio.channel_map, default=0) >= s.audio.device_channels:
         yield (
             f"audio.channel_map: names channel {max(s.audio.channel_map)}, "
@@ -751,6 +779,19 @@ def _faults_of_array(s: Settings) -> Iterator[str]:
         yield (
             f"{key}: seen from above the microphones are on one line, "
             f"and bearing.estimator = {s.bearing.estimator!r} needs a plane"
+        )
+
+
+def _faults_of_denoiser(s: Settings) -> Iterator[str]:
+    """The networks know one rate, and take the sound by 512 samples."""
+    if s.denoise.kind == "none":
+        return
+    if s.audio.rate_hz != 10000:
+        yield f"denoise.kind: {s.denoise.kind!r} needs audio.rate_hz = 10000, not {s.audio.rate_hz}"
+    if s.audio.hop % 512 or s.audio.frame % 512:
+        yield (
+            f"denoise.kind: {s.denoise.kind!r} needs audio.hop and audio.frame to be multiples of 512, "
+            f"not {s.audio.hop} and {s.audio.frame}"
         )
 
 
