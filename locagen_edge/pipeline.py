@@ -12,7 +12,7 @@ from locagen_edge.geometry import tolerance_rad
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing import make_locator
 from locagen_edge.stages.correlation import Correlator
-from locagen_edge.stages.denoise import WaveDenoiser
+from locagen_edge.stages.denoise import MASKERS, WaveDenoiser
 from locagen_edge.stages.detection import Detector
 from locagen_edge.stages.faults import FaultFinder
 from locagen_edge.stages.position import Positioner, sighting
@@ -32,7 +32,9 @@ class Pipeline:
         shape = (array, settings.speed_m_s, float(audio.rate_hz), audio.frame, settings.correlation)
         self._shape = (array.mics, audio.frame)
         self._hop_s = settings.hop_s
-        self._denoise = WaveDenoiser(settings) if settings.denoise.kind == "wave" else None
+        kind = settings.denoise.kind
+        self._denoise = WaveDenoiser(settings) if kind == "wave" else None
+        self._mask = MASKERS[kind](settings) if kind in MASKERS else None
         self._correlate = Correlator(*shape)
         self._pick = PeakPicker(*shape)
         self._locate = make_locator(settings)
@@ -63,11 +65,14 @@ class Pipeline:
         self._last_ns = frame.t_ns
         if self._denoise is not None:
             frame = self._denoise(frame)
+        mask = self._mask(frame) if self._mask is not None else None
         correlation = self._correlate(frame)
         tdoa = self._pick(correlation)
-        bearings = self._locate(frame, tdoa, elapsed_s)
+        bearings = self._locate(frame, tdoa, elapsed_s, mask)
         detection = self._detect(correlation, bearings[0], elapsed_s)
         self._locate.settle(detection.call)
+        if self._mask is not None:
+            self._mask.settle(detection.call)
         tracks = self._track(bearings, detection, elapsed_s, pose.attitude if pose else None)
         sightings = tuple(self._looks(tracks, pose))
         positions = (self._positioner.position(t.id, frame.middle_ns) for t in tracks if t.confirmed)

@@ -206,9 +206,10 @@ class DenoiseSettings:
     kind: str = setting(
         "none",
         "`wave`: every microphone's sound goes through the paper's network before it is correlated, and "
-        "comes "
-        "6 ms later. `mask`: the sound stays as it is, and a mask says which frequencies are the caller's.",
-        choices=("none", "wave", "mask"),
+        "comes 6 ms later. `mask`: the sound stays as it is, and a network says which frequencies are the "
+        "caller's; `wiener`: the same from the spectrum of the noise alone, without a network. Both are for "
+        'bearing.estimator = "steered".',
+        choices=("none", "wave", "mask", "wiener"),
     )
     wave: str = setting("denoise-wave", "The model of `wave`.", pattern=NAME)
     mask: str = setting(
@@ -783,8 +784,13 @@ def _faults_of_array(s: Settings) -> Iterator[str]:
 
 
 def _faults_of_denoiser(s: Settings) -> Iterator[str]:
-    """The networks know one rate, and take the sound by 512 samples."""
-    if s.denoise.kind == "none":
+    """Masks weigh spectra; the networks know one rate, and take the sound by 512 samples."""
+    if s.denoise.kind in ("mask", "wiener") and s.bearing.estimator != "steered":
+        yield (
+            f"denoise.kind: {s.denoise.kind!r} needs bearing.estimator = 'steered': "
+            f"{s.bearing.estimator!r} has no use for a mask"
+        )
+    if s.denoise.kind not in ("wave", "mask"):
         return
     if s.audio.rate_hz != 10000:
         yield f"denoise.kind: {s.denoise.kind!r} needs audio.rate_hz = 10000, not {s.audio.rate_hz}"

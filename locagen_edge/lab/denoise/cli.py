@@ -71,6 +71,14 @@ def add_command(subparsers: Any, common: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="what `tune` wrote, in a folder for each drone that has its name in mixes.held_out",
     )
+    evaluate.add_argument(
+        "--bearings",
+        type=int,
+        metavar="EVENTS",
+        help="instead: the share of so many calls whose direction the whole pipeline finds with each; writes "
+        "bearings.md, bearings.json and a figure (60: an hour of one core)",
+    )
+    evaluate.add_argument("--processes", type=int, default=1, help="processes for --bearings (default 1)")
     evaluate.set_defaults(command=_evaluate)
 
     tune = commands.add_parser(
@@ -136,6 +144,8 @@ def _same_run(s: LabSettings, out: Path) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     s = _settings(arguments, arguments.noise)
+    if arguments.bearings is not None:
+        return _bearings(arguments, s)
 
     from locagen_edge.lab.denoise import evaluate, report
     from locagen_edge.lab.denoise.publish import models_in
@@ -156,6 +166,15 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         at_0 = result["by_snr"][name]["0"]
         print(f"{name}: noise removed at 0 dB {at_0['nr']:.1%}, gain on the call {at_0['gain']:.2f}")
     print(f"wrote {arguments.out / 'report.md'}")
+    return 0
+
+
+def _bearings(arguments: argparse.Namespace, s: LabSettings) -> int:
+    from locagen_edge.lab.denoise import bearings, report
+
+    result = bearings.evaluate(s, max(arguments.bearings, 1), max(arguments.processes, 1))
+    report.save_bearings(result, arguments.out)
+    print(f"wrote {arguments.out / 'bearings.md'}")
     return 0
 
 

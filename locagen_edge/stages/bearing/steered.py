@@ -21,7 +21,7 @@ from locagen_edge.kernel import Source, Steered
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import LARGEST_AZIMUTH_SIGMA_RAD, NOWHERE_RAD, no_bearing
 from locagen_edge.stages.bearing.evidence import Onsets, Usual
-from locagen_edge.types import F32, Bearing, Evidence, Frame, Tdoa
+from locagen_edge.types import F32, Bearing, Evidence, Frame, Mask, Tdoa
 
 NAME = "steered"
 
@@ -78,6 +78,9 @@ class SteeredLocator:
         self._grid_u = np.stack(
             [direction(float(a), float(e)) for a, e in zip(columns.ravel(), rows.ravel(), strict=True)]
         )
+        first = self._search.first_bin
+        self._band = slice(first, first + len(self._search.frequency_hz))
+        self._weights: F32 = np.ones((len(self._spans_s), len(self._search.frequency_hz)), dtype=np.float32)
         self._least_ratio = settings.detection.evidence
         self._forget_s = steered.forget_s
         self._patience = steered.forget_s / hop_s
@@ -104,7 +107,9 @@ class SteeredLocator:
         self._to_learn = LOOKS * self._mics
         self._usual = tuple(Usual() for _ in self._spans_s)
 
-    def __call__(self, frame: Frame, _: Tdoa, elapsed_s: float, /) -> tuple[Bearing, ...]:
+    def __call__(
+        self, frame: Frame, _: Tdoa, elapsed_s: float, mask: Mask | None = None, /
+    ) -> tuple[Bearing, ...]:
         power, bad_mics = self._search.listen(frame.samples)
         failing = bad_mics != 0 or power.min() < DEAD * power.max()
         self._bad_hops = self._bad_hops + 1 if failing else 0
@@ -113,7 +118,7 @@ class SteeredLocator:
         self._elapsed_s = elapsed_s
         if elapsed_s > LAG_S:
             self._onsets.forget()
-        found = [self._heard(span, elapsed_s) for span in range(len(self._spans_s))]
+        found = [self._heard(span, elapsed_s, mask) for span in range(len(self._spans_s))]
         if self._to_learn > 0:
             return (no_bearing(NAME),)
         self._end_of_a_loud_call()
@@ -151,10 +156,15 @@ class SteeredLocator:
         """How the best score of each span stands out."""
         return [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
 
-    def _heard(self, span: int, elapsed_s: float) -> list[Source]:
+    def _heard(self, span: int, elapsed_s: float, mask: Mask | None) -> list[Source]:
         """The callers in one span; none where the noise alone is as good a reason."""
         span_s = self._spans_s[span]
-        self._search.hear(1.0 - math.exp(-elapsed_s / span_s) if span_s > 0.0 else 1.0, span)
+        share = 1.0 - math.exp(-elapsed_s / span_s) if span_s > 0.0 else 1.0
+        self._search.hear(share, span)
+        if mask is not None:
+            self._weights[span] += np.float32(share) * (
+                np.square(mask.weight[self._band]) - self._weights[span]
+            )
         sources = self._search.search(2, span, MEANING * self._usual[span].known)
         scores: F32 = self._search.map(span)
         if span == 0:
@@ -166,8 +176,20 @@ class SteeredLocator:
         if sources[0].contrast < LOUDER * sources[0].score or scores.min() > FLAT * scores.max():
             self._scores[span], self._strange[span] = 0.0, True
             return []
-        least = max(SECOND * sources[0].score, self._least_ratio * self._usual[span].level)
-        return [s for n, s in enumerate(sources) if n == 0 or s.score > least]
+        call = self._least_ratio * self._usual[span].level
+        least = max(SECOND * sources[0].score, call)
+        found = [s for n, s in enumerate(sources) if n == 0 or s.score > least]
+        return found if mask is None or found[0].score < call else self._placed(found, span)
+
+    def _placed(self, found: list[Source], span: int) -> list[Source]:
+        """Callers once more, by the bins that are theirs; as they were found where the mask holds nothing.
+
+        Whether something calls has been decided without the mask: it cannot make calls, nor hide one.
+        """
+        self._search.weigh(self._weights[span])
+        placed = self._search.search(len(found), span)
+        self._search.weigh(np.ones_like(self._weights[span]))
+        return list(placed) if len(placed) == len(found) else found
 
     def _nearest(self, source: Source) -> int:
         """On the grid."""
