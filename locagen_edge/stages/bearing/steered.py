@@ -93,6 +93,7 @@ class SteeredLocator:
         self._strange_hops = 0
         self._loud_hops_ago: int | None = None
         self._elapsed_s = 0.0
+        self._mask: Mask | None = None
         # A microphone that fails for a moment must not be missing from the matrix for long after; one that
         # has failed for good must not keep the others from learning.
         self._bad_hops = 0
@@ -116,9 +117,10 @@ class SteeredLocator:
         self._failing.append(bool(failing))
         self._silent.append(bool(power.max() < SILENCE))
         self._elapsed_s = elapsed_s
+        self._mask = mask
         if elapsed_s > LAG_S:
             self._onsets.forget()
-        found = [self._heard(span, elapsed_s, mask) for span in range(len(self._spans_s))]
+        found = [self._heard(span, elapsed_s) for span in range(len(self._spans_s))]
         if self._to_learn > 0:
             return (no_bearing(NAME),)
         self._end_of_a_loud_call()
@@ -137,7 +139,8 @@ class SteeredLocator:
             # an average over a second remembers what has ended
             if span == 0 or self._onsets.going_on(towards):
                 evidence = Evidence(ratios[span], self._onsets.since_s(towards))
-                return tuple(self._told(source, span, evidence) for source in found[span])
+                sources = found[span] if self._mask is None else self._placed(found[span], span)
+                return tuple(self._told(source, span, evidence) for source in sources)
         return ()
 
     def _end_of_a_loud_call(self) -> None:
@@ -156,16 +159,15 @@ class SteeredLocator:
         """How the best score of each span stands out."""
         return [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
 
-    def _heard(self, span: int, elapsed_s: float, mask: Mask | None) -> list[Source]:
+    def _heard(self, span: int, elapsed_s: float) -> list[Source]:
         """The callers in one span; none where the noise alone is as good a reason."""
         span_s = self._spans_s[span]
         share = 1.0 - math.exp(-elapsed_s / span_s) if span_s > 0.0 else 1.0
         self._search.hear(share, span)
-        if mask is not None:
-            self._weights[span] += np.float32(share) * (
-                np.square(mask.weight[self._band]) - self._weights[span]
-            )
-        sources = self._search.search(2, span, MEANING * self._usual[span].known)
+        if self._mask is not None:
+            weight = np.square(self._mask.weight[self._band])  # a gain's square is what is left of power
+            self._weights[span] += np.float32(share) * (weight - self._weights[span])
+        sources = self._sources(span)
         scores: F32 = self._search.map(span)
         if span == 0:
             self._onsets.hear(scores)
@@ -176,20 +178,23 @@ class SteeredLocator:
         if sources[0].contrast < LOUDER * sources[0].score or scores.min() > FLAT * scores.max():
             self._scores[span], self._strange[span] = 0.0, True
             return []
-        call = self._least_ratio * self._usual[span].level
-        least = max(SECOND * sources[0].score, call)
-        found = [s for n, s in enumerate(sources) if n == 0 or s.score > least]
-        return found if mask is None or found[0].score < call else self._placed(found, span)
+        least = max(SECOND * sources[0].score, self._least_ratio * self._usual[span].level)
+        return [s for n, s in enumerate(sources) if n == 0 or s.score > least]
+
+    def _sources(self, span: int) -> tuple[Source, ...]:
+        return self._search.search(2, span, MEANING * self._usual[span].known)
 
     def _placed(self, found: list[Source], span: int) -> list[Source]:
-        """Callers once more, by the bins that are theirs; as they were found where the mask holds nothing.
+        """Callers once more, by the bins that are theirs; as they were found where those hold too little.
 
-        Whether something calls has been decided without the mask: it cannot make calls, nor hide one.
+        Whether something calls has been decided without the mask, which can neither make a call nor hide one.
         """
+        if self._ratios()[span] < self._least_ratio:
+            return found
         self._search.weigh(self._weights[span])
-        placed = self._search.search(len(found), span)
+        placed = self._sources(span)
         self._search.weigh(np.ones_like(self._weights[span]))
-        return list(placed) if len(placed) == len(found) else found
+        return list(placed[: len(found)]) if len(placed) >= len(found) else found
 
     def _nearest(self, source: Source) -> int:
         """On the grid."""
