@@ -77,6 +77,7 @@ format: $(VENV)/.dev ## rewrites the sources in the one format, the sample setti
 	$(BIN)/ruff check --fix -q . ; $(BIN)/ruff format .
 	$(BIN)/python -m locagen_edge.settings > systemd/locagen-edge.toml.tmp && mv systemd/locagen-edge.toml.tmp systemd/locagen-edge.toml
 	$(BIN)/python -m locagen_edge.mavlink.build_dialect --docs docs/mavlink.md
+	$(BIN)/python -m locagen_edge.mavlink.build_docs docs/mavlink.md
 
 $(VENV)/.dev: $(VENV)/.flight
 	@echo "setting up $(VENV) for development (once)"
@@ -112,6 +113,7 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(BIN)/python bench/bench_pipeline.py
 	$(BIN)/python bench/bench_framer.py
 	$(BIN)/python bench/bench_accuracy.py --trials 100
+	$(BIN)/python bench/bench_detection.py
 	$(BIN)/python bench/bench_twin.py
 	$(BIN)/python bench/bench_position.py
 

@@ -123,6 +123,9 @@ typedef struct {
  * contrast: the same for the strongest source against "all of the noise has become louder": below 0 where
  * rotors rise, wind or a touch of the microphones is the better reason.
  *
+ * rival: of the strongest source, score of the best direction in another lobe over its own: near 1 where a narrow
+ * sound has several answers, for microphones farther apart than half of its wavelength.
+ *
  * snr: per microphone, power ratio: (mean q - 1) / microphones, 0 or more. Under coloured noise: that of white
  * noise in which the source would be as well seen.
  *
@@ -135,6 +138,7 @@ typedef struct {
     float elevation_rad; /* positive up; of two images that a flat array cannot tell apart the lower one */
     float score;
     float contrast;
+    float rival;
     float snr;
     float information[3];
 } locagen_source;
@@ -185,10 +189,8 @@ int locagen_steer_watch(locagen_steer *state, int32_t span);
  * false-alarm rate. */
 int locagen_steer_settle(locagen_steer *state, int32_t span, float share);
 
-/* Instead of watch, while something may call: drops what was put aside, and of the last search keeps in mind
- * what lets nothing grow by more than the share `growth`: little of a call, but noise that is taken for calls
- * again and again ceases to be. */
-int locagen_steer_doubt(locagen_steer *state, int32_t span, float share, float growth);
+/* Instead of watch, while something calls: what was put aside is dropped. */
+int locagen_steer_doubt(locagen_steer *state, int32_t span);
 
 /* Weights 0 to 1 of all bins, for the searches to come: each bin counts as so many looks less. */
 int locagen_steer_weigh(locagen_steer *state, const float *weight);

@@ -576,7 +576,7 @@ int locagen_steer_settle(locagen_steer *memory, int32_t span, float share)
     return LOCAGEN_OK;
 }
 
-int locagen_steer_doubt(locagen_steer *memory, int32_t span, float share, float growth)
+int locagen_steer_doubt(locagen_steer *memory, int32_t span)
 {
     if (memory == NULL)
         return LOCAGEN_E_NULL;
@@ -584,20 +584,11 @@ int locagen_steer_doubt(locagen_steer *memory, int32_t span, float share, float 
     locagen_span *x = span_of(s, span);
     if (x == NULL)
         return LOCAGEN_E_SPAN;
-    if (!within((double)share, 0, 1) || !within((double)growth, 0, 1))
-        return LOCAGEN_E_SHARE;
     for (int i = 0; i < 2; i++)
         if (x->aside_count[i] > 0) {
             memset(x->aside[i], 0, (size_t)spread_count(s) * sizeof *x->aside[i]);
             x->aside_count[i] = 0;
         }
-    if (x->heard <= 0 || s->learnt <= 0 || share == 0)
-        return LOCAGEN_OK;
-    double prior = prior_of(s, x), total = x->watched + prior;
-    double most = 1 + (double)growth * (total + (double)share) / (double)share;
-    s->paths->blend_squares(spread_count(s), share, over_theory(s, x), (float)(most / total),
-                            (float)(most * prior / total), x->over, x->spread);
-    x->watched = (double)(1.0f - share) * x->watched + (double)share;
     return LOCAGEN_OK;
 }
 
@@ -804,6 +795,38 @@ static double unbiased(const steer *s, int mics)
     return fmax(LEAST_UNBIASED, (n - mics + 1) * (n - mics) / (n * n));
 }
 
+/* Whether a direction of the grid is no lower than those beside it: each row is a circle, rows end. */
+static int is_top(const steer *s, const float *scores, int n)
+{
+    int row = n / s->azimuths, column = n % s->azimuths;
+    int left = row * s->azimuths + (column + s->azimuths - 1) % s->azimuths;
+    int right = row * s->azimuths + (column + 1) % s->azimuths;
+    return scores[n] >= scores[left] && scores[n] >= scores[right] &&
+           (row == 0 || scores[n] >= scores[n - s->azimuths]) &&
+           (row == s->elevations - 1 || scores[n] >= scores[n + s->azimuths]);
+}
+
+/* Score of the best top elsewhere, over that of the best. */
+static double rival(const steer *s, const locagen_spread *spread, double t, const float *scores, const aim *best)
+{
+    int at = -1;
+    for (int n = 0; n < s->azimuths * s->elevations; n++)
+        if ((at < 0 || scores[n] > scores[at]) && is_top(s, scores, n) &&
+            !same_lobe(s, s->grid_u + 3 * n, best->u))
+            at = n;
+    if (at < 0)
+        return 0;
+    aim a = {.at = at, .score = (double)scores[at]};
+    if (scores[at] > CLOSE * CLOSE * scores[best->at]) {
+        memcpy(a.u, s->grid_u + 3 * at, sizeof a.u);
+        count_fine_bins(s, spread, t, at);
+        refine(s, MEASURE_RATIO, &a);
+        if (same_lobe(s, a.u, best->u))
+            return 0;
+    }
+    return a.score / best->score;
+}
+
 /* How R_n is to be had; where it was never learnt, its level from the power across the direction of most
  * power. Leaves its inverse for whitening. */
 static locagen_whitening whitening(steer *s, const locagen_span *x)
@@ -938,7 +961,7 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
     locagen_spread spread = spread_of(s, x);
     int count = __builtin_popcount((unsigned)how.mics), found = 0;
     aim aims[MOST_MICS];
-    double score[MOST_MICS], mean_q[MOST_MICS], t = looks(s, x), first = 0;
+    double score[MOST_MICS], mean_q[MOST_MICS], t = looks(s, x), first = 0, second = 0;
     count_bins(s, t);
     for (; found < most && found < count - 1; found++, how.nulls++) {
         aim *a = &aims[found];
@@ -946,8 +969,10 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
         if (!find_best(s, MEASURE_RATIO, &spread, t, least, found == 0 ? x->scores : s->scores, a))
             break;
         score[found] = a->score, mean_q[found] = a->mean_q;
-        if (found == 0)
+        if (found == 0) {
             first = contrast(s, &spread, a->at, count);
+            second = rival(s, &spread, t, x->scores, a);
+        }
         spread.over = NULL; /* with nulls they would not be those of the noise */
         add_null(s, found, a->u);
         s->fine.least = s->coarse.least = LEAST_AFTER_NULL * (float)count;
@@ -961,6 +986,7 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
         aims[n].score = score[n], aims[n].mean_q = mean_q[n];
         out[n] = told(&aims[n], how.mics);
         out[n].contrast = (float)first;
+        out[n].rival = n == 0 ? (float)second : 0.0f;
     }
     return found;
 }

@@ -107,8 +107,6 @@ typedef struct locagen_steer_paths {
     void (*add)(const steer *s, int32_t slot, float keep, float share, float *matrix);
     void (*add_squares)(long count, float scale, float most, const float *over, float *sum);
     void (*blend)(long count, float keep, float share, const float *from, float *to);
-    void (*blend_squares)(long count, float share, float scale, float rate, float offset, const float *over,
-                          float *spread);
     void (*invert)(const steer *s, const locagen_whitening *how);
     void (*whiten)(const steer *s, const locagen_whitening *how);
     void (*score)(const steer *s, const locagen_response *r, enum locagen_measure measure,

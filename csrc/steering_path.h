@@ -129,16 +129,6 @@ STEP void add_squares(long count, float scale, float most, const float *over, fl
     }
 }
 
-/* The squares themselves, none more than `rate` times what is there, plus `offset`. */
-STEP void blend_squares(long count, float share, float scale, float rate, float offset, const float *over,
-                        float *spread)
-{
-    for (long n = 0; n < count; n += WIDTH) {
-        vec x = load(over + n), old = load(spread + n), most = rate * old + offset;
-        store(spread + n, (1.0f - share) * old - share * larger(-scale * x * x, -most));
-    }
-}
-
 static void score_groups(const steer *s, const locagen_response *r, enum locagen_measure measure,
                          const locagen_spread *spread, const float *phases, int32_t groups, float *score,
                          float *mean_q)

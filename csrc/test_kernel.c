@@ -727,15 +727,14 @@ static void test_steered_refusals(void)
         CHECK(locagen_steer_hear(b.kernel, span, 0.5f) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_watch(b.kernel, span) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_settle(b.kernel, span, 0.5f) == LOCAGEN_E_SPAN, "span %d", span);
-        CHECK(locagen_steer_doubt(b.kernel, span, 0.5f, 0.1f) == LOCAGEN_E_SPAN, "span %d", span);
+        CHECK(locagen_steer_doubt(b.kernel, span) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_search(b.kernel, span, 1, 0, b.sources) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_map(b.kernel, span, b.map) == LOCAGEN_E_SPAN, "span %d", span);
     }
     CHECK(locagen_steer_watch(NULL, 0) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_settle(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_settle(b.kernel, 0, NAN) == LOCAGEN_E_SHARE, "no share");
-    CHECK(locagen_steer_doubt(NULL, 0, 0.5f, 0.1f) == LOCAGEN_E_NULL, "no state");
-    CHECK(locagen_steer_doubt(b.kernel, 0, 0.5f, NAN) == LOCAGEN_E_SHARE, "no limit");
+    CHECK(locagen_steer_doubt(NULL, 0) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_weigh(NULL, b.in) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_weigh(b.kernel, NULL) == LOCAGEN_E_NULL, "no weights");
     b.in[1] = 1.01f;

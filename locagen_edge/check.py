@@ -12,6 +12,7 @@ from dataclasses import replace
 from locagen_edge.errors import LocagenError, SourceHungError
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.link import Link, parse
+from locagen_edge.mavlink.parameters import kept
 from locagen_edge.mavlink.signing import Guard, guard_of
 from locagen_edge.models import directory_of, load_model, read_manifest
 from locagen_edge.pipeline import Pipeline
@@ -29,9 +30,18 @@ ALIVE = Status(hearing=True, track=None, snr_db=0.0, faults=())
 
 def check(settings: Settings, seconds: float) -> Iterator[Finding]:
     """Findings in the order of the way: settings, models, microphones, link. Listens for `seconds`."""
+    settings, told, faults = kept(settings)
     array = settings.mic_array
     longest = array.longest_delay_s(settings.speed_m_s) * settings.audio.rate_hz
     yield True, "settings", f"{array.mics} microphones, longest delay {longest:.2f} samples"
+    for text in told:
+        yield True, "parameters", text
+    for text in faults:
+        yield False, "parameters", text
+    for name in ("roi", "yaw"):
+        if getattr(settings.flight, name):
+            modes = ", ".join(settings.flight.modes)
+            yield True, "flight", f"flight.{name} is ON: we may command the vehicle in mode {modes}"
     yield from _models(settings)
     try:
         pipeline = Pipeline(settings)

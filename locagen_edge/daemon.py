@@ -22,10 +22,13 @@ from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from locagen_edge.errors import LinkError, SourceError, SourceHungError
-from locagen_edge.mavlink.component import Component, Status, is_confirmed
+from locagen_edge.errors import LinkError, LocagenError, SourceError, SourceHungError
+from locagen_edge.mavlink.component import Component, Hands, Status, is_confirmed
+from locagen_edge.mavlink.computer import Computer
+from locagen_edge.mavlink.identity import machine_uid
 from locagen_edge.mavlink.link import parse
 from locagen_edge.mavlink.links import Links
+from locagen_edge.mavlink.parameters import keep, kept, kept_file
 from locagen_edge.mavlink.signing import SAVE_S, guard_of, save_timestamp, state_file
 from locagen_edge.notify import notify
 from locagen_edge.pipeline import Pipeline
@@ -99,12 +102,35 @@ class Daemon:
         self._said_s = -math.inf
         self._save_s = math.inf
         self._complaints: tuple[str, ...] = ()
+        self._applied = settings
+        self._applying: asyncio.Future[None] | None = None
+        self._keeping: asyncio.Future[None] | None = None
+        self._kept: dict[str, float] = {}
 
     async def startup(self) -> None:
         """Makes pipeline and links. Raises `LocagenError` where the settings cannot be flown with."""
         guard = guard_of(self.settings)
         self._save_s = time.monotonic() + SAVE_S if guard.signs else math.inf
-        self.component = Component(self.settings.mavlink, pose=self.settings.pose, guard=guard)
+        base = self.settings
+        self.settings, told, faults = kept(base)
+        for text in (*told, *faults):
+            log.warning("%s", text)
+        self._applied = self.settings
+        self.component = Component(
+            self.settings.mavlink,
+            pose=self.settings.pose,
+            guard=guard,
+            whole=self.settings,
+            base=base,
+            hands=Hands(
+                apply=self._apply,
+                listen=self._listen,
+                forget_noise=self._forget_noise,
+                computer=Computer(disk=kept_file(base).parent).status,
+                uid=machine_uid(),
+            ),
+        )
+        self._kept = self.component.parameters.changed
         self.links = Links(
             [parse(link) for link in self.settings.mavlink.link],
             backoff_s=self.settings.daemon.backoff_s,
@@ -160,7 +186,12 @@ class Daemon:
         for task in self._tasks:
             if task.done() and not task.cancelled() and (error := task.exception()) is not self._told:
                 log.error("while stopping, %s: %s", task.get_name(), error)
+        if self._applying is not None:
+            self._applying.cancel()
         self._executor.shutdown(wait=False, cancel_futures=True)
+        if self.component.parameters.changed != self._kept:
+            with contextlib.suppress(OSError):
+                keep(kept_file(self.settings), self.component.parameters.changed)
         if self.component.guard.signs:
             self._remember_timestamp()
         if self.black_box is not None:
@@ -211,6 +242,10 @@ class Daemon:
     async def _work(self) -> None:
         loop = asyncio.get_running_loop()
         while (frame := await self._queue.get()) is not None:
+            if not self.component.listening:  # told to stop: not looked at, not kept
+                self.estimate, self._heard_s = None, time.monotonic()
+                self._tell_ready()
+                continue
             self._working = True
             pose = frame.pose or self.component.poses.at(frame.middle_ns)
             estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
@@ -226,6 +261,57 @@ class Daemon:
             self.counters.latency_s.append((time.monotonic_ns() - end_ns) * 1e-9)
             self._send()
             self._tell_ready()
+
+    # --- what is asked over MAVLink: none of it waits
+
+    def _apply(self, settings: Settings) -> None:
+        """New settings for the pipeline, between two frames: its one thread does one thing after the other.
+
+        What comes while others are being applied waits, and only the last of it counts.
+        """
+        self.settings = settings
+        if self._applying is None:
+            self._applying = asyncio.ensure_future(self._apply_all())
+
+    async def _apply_all(self) -> None:
+        loop = asyncio.get_running_loop()
+        while (wanted := self.settings) is not self._applied:
+            try:
+                await loop.run_in_executor(self._executor, self.pipeline.apply, wanted)
+            except Exception as error:  # whatever it is, the old settings go on listening
+                expected = isinstance(error, LocagenError)
+                log.error("parameters are not applied: %s", error, exc_info=not expected)
+                self.settings = self._applied
+                self.component.put_back(self._applied, f"Not applied: {error}")
+            else:
+                self._applied = wanted
+                log.info("settings by parameters: %s", self.component.parameters.changed or "none")
+        self._applying = None
+
+    def _listen(self, on: bool) -> None:
+        log.warning("%s, as commanded over MAVLink", "listening again" if on else "stopped listening")
+
+    def _forget_noise(self) -> None:
+        log.warning("the noise is learnt anew, as commanded over MAVLink")
+        self._executor.submit(self.pipeline.forget_noise)
+
+    def _keep_parameters(self) -> None:
+        """What was changed, on disk: a second later at most, and never on the loop that carries sound."""
+        changed = self.component.parameters.changed
+        if self._applying or self._keeping or changed == self._kept:
+            return
+        self._kept = changed
+        loop = asyncio.get_running_loop()
+        self._keeping = loop.run_in_executor(None, keep, kept_file(self.settings), changed)
+        self._keeping.add_done_callback(self._have_kept)
+
+    def _have_kept(self, done: asyncio.Future[None]) -> None:
+        self._keeping = None
+        if not done.cancelled() and (error := done.exception()):
+            why = error.strerror if isinstance(error, OSError) else str(error)
+            text = f"Parameters are not kept over a restart: {kept_file(self.settings).parent}: {why}"
+            log.error("%s", text)
+            self.component.tell_fault(text)
 
     def _tell_ready(self) -> None:
         """Ready is who hears, or knows why not and will go on trying."""
@@ -295,6 +381,7 @@ class Daemon:
             if self._on_second is not None:
                 self._on_second(self)
             self._watch_signing()
+            self._keep_parameters()
             if self.hearing or self.source_fault:
                 notify(WATCHDOG="1", STATUS=self._in_words())
             else:
@@ -332,7 +419,9 @@ class Daemon:
     def _in_words(self) -> str:
         """The service manager's status line: state, and every loss since the start."""
         c = self.counters
-        state = "listening" if self.hearing else f"no sound: {self.source_fault or 'waiting'}"
+        state = "listening" if self.component.listening else "told to stop listening"
+        if not self.hearing:
+            state = f"no sound: {self.source_fault or 'waiting'}"
         losses = f"{c.dropped} dropped, {c.overruns} overruns, {self.links.dropped} messages lost"
         if self.black_box is not None and self.black_box.lost:
             losses += f", {self.black_box.lost} log records lost"

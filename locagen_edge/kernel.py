@@ -139,6 +139,8 @@ class Source:
     """log of the likelihood ratio against "noise only"; noise alone gives some tens at 451 bins"""
     contrast: float
     """the same against "all of the noise is louder now", of the strongest source"""
+    rival: float
+    """of the strongest source: score of the best direction elsewhere over its own; near 1: several answers"""
     snr: float
     """power ratio per microphone, over the band's bins, as if the noise were white"""
     information: tuple[float, float, float]
@@ -306,9 +308,9 @@ class Steered:
         """
         _check(lib.locagen_steer_settle(self._state, span, share))
 
-    def doubt(self, share: float, growth: float, span: int = 0) -> None:
-        """Instead of `watch`, while something may call: drops what was put aside, keeps little in mind."""
-        _check(lib.locagen_steer_doubt(self._state, span, share, growth))
+    def doubt(self, span: int = 0) -> None:
+        """Instead of `watch`, while something calls: drops what was put aside."""
+        _check(lib.locagen_steer_doubt(self._state, span))
 
     def weigh(self, weight: npt.NDArray[np.float32]) -> None:
         """Weights 0 to 1 of all bins in the band, float32, shape `(bins,)`, for the searches to come."""
@@ -324,7 +326,7 @@ class Steered:
         room = min(max_sources, _MOST_MICS)
         found = _check(lib.locagen_steer_search(self._state, span, room, least, self._sources))
         return tuple(
-            Source(s.azimuth_rad, s.elevation_rad, s.score, s.contrast, s.snr, tuple(s.information))
+            Source(s.azimuth_rad, s.elevation_rad, s.score, s.contrast, s.rival, s.snr, tuple(s.information))
             for s in self._sources[0:found]
         )
 

@@ -6,13 +6,16 @@ The same object flies in the daemon, replays recordings, is tested and is timed.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 
-from locagen_edge.errors import SourceError
+from locagen_edge.errors import SettingsError, SourceError
 from locagen_edge.geometry import tolerance_rad
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing import make_locator
+from locagen_edge.stages.bearing.common import Locator
 from locagen_edge.stages.correlation import Correlator
-from locagen_edge.stages.denoise import MASKERS, WaveDenoiser
+from locagen_edge.stages.denoise import MASKERS, Masker, WaveDenoiser
 from locagen_edge.stages.detection import Detector
 from locagen_edge.stages.faults import FaultFinder
 from locagen_edge.stages.position import Positioner, sighting
@@ -29,18 +32,13 @@ class Pipeline:
 
     def __init__(self, settings: Settings):
         array, audio = settings.mic_array, settings.audio
-        shape = (array, settings.speed_m_s, float(audio.rate_hz), audio.frame, settings.correlation)
+        self._settings = settings
         self._shape = (array.mics, audio.frame)
         self._hop_s = settings.hop_s
-        kind = settings.denoise.kind
-        self._denoise = WaveDenoiser(settings) if kind == "wave" else None
-        self._mask = MASKERS[kind](settings) if kind in MASKERS else None
-        self._correlate = Correlator(*shape)
-        self._pick = PeakPicker(*shape)
-        self._locate = make_locator(settings)
+        self._denoise, self._mask = _made_denoiser(settings)
+        self._correlate, self._pick, self._locate = _made_for_array(settings)
         self._detect = Detector(settings.detection)
         self._find_faults = FaultFinder(settings)
-        self._settings = settings
         self._tolerance_rad = tolerance_rad(array, settings.array.tolerance_m)
         self._positioner = Positioner(settings.position)
         self._track = Tracker(
@@ -51,6 +49,34 @@ class Pipeline:
             array.normal,
         )
         self._last_ns: int | None = None
+
+    def apply(self, settings: Settings) -> None:
+        """New settings from the next frame on: call it between two frames.
+
+        What has been learnt stays, except that a locator for another array or another speed of sound starts
+        anew with the noise; callers keep their tracks and numbers. Sound of another shape takes another
+        pipeline.
+        Raises as the constructor does, and nothing has changed then.
+        """
+        if settings.audio != self._settings.audio:
+            raise SettingsError("audio: cannot be changed while sound comes in")
+        denoiser = self._denoise, self._mask
+        if _for_denoiser(settings) != _for_denoiser(self._settings):
+            denoiser = _made_denoiser(settings)
+        if _for_array(settings) != _for_array(self._settings):
+            self._correlate, self._pick, self._locate = _made_for_array(settings)
+            self._find_faults.apply(settings)
+        self._denoise, self._mask = denoiser
+        self._settings = settings
+        self._locate.apply(settings)
+        self._detect.apply(settings.detection)
+        self._track.apply(settings.track, settings.pose, settings.mic_array.normal)
+
+    def forget_noise(self) -> None:
+        """Learns background and noise from nothing: call it between two frames."""
+        self._locate.forget()
+        self._denoise, self._mask = _made_denoiser(self._settings)
+        self._detect.forget()
 
     def process(self, frame: Frame, pose: Pose | None = None) -> Estimate:
         """The estimate for one frame. Frames have to come in the order of time; gaps are allowed.
@@ -101,3 +127,35 @@ class Pipeline:
             look = sighting(pose, track.look, track.id, s.position, s.pose, self._tolerance_rad)
             if look is not None and self._positioner.see(look):
                 yield look
+
+
+def _made_for_array(settings: Settings) -> tuple[Correlator, PeakPicker, Locator]:
+    """The stages with tables for array and speed of sound."""
+    audio = settings.audio
+    shape = (
+        settings.mic_array,
+        settings.speed_m_s,
+        float(audio.rate_hz),
+        audio.frame,
+        settings.correlation,
+    )
+    return Correlator(*shape), PeakPicker(*shape), make_locator(settings)
+
+
+def _made_denoiser(settings: Settings) -> tuple[WaveDenoiser | None, Masker | None]:
+    """What `denoise.kind` names: it cleans the sound, or it weighs the bearing's bins."""
+    kind = settings.denoise.kind
+    make_mask = MASKERS.get(kind)
+    return WaveDenoiser(settings) if kind == "wave" else None, make_mask(settings) if make_mask else None
+
+
+def _for_denoiser(settings: Settings) -> tuple[Any, ...]:
+    """What it is made of."""
+    return settings.denoise, settings.array, settings.correlation.band_hz, settings.models
+
+
+def _for_array(settings: Settings) -> tuple[Any, ...]:
+    """What those tables are made of: all that their stages read, less what `Locator.apply` takes."""
+    s = settings
+    steered = replace(s.steered, span_s=1.0, forget_s=1.0)
+    return s.array, s.environment, s.correlation, s.bearing, s.models, steered

@@ -503,12 +503,6 @@ class MavlinkSettings:
     rate_hz: float = setting(
         2.0, "How often a bearing is sent while something calls.", unit="Hz", least=0.1, most=20
     )
-    records: tuple[str, ...] = setting(
-        ("message", "tunnel"),
-        "How LOCAGEN_BEARING and LOCAGEN_POSITION (docs/mavlink.md) are sent: as `message`, inside a "
-        "`tunnel` for paths that drop messages they do not know, or both; []: not at all.",
-        pattern="message|tunnel",
-    )
     signing_key: str = setting(
         "",
         "A file with the key for MAVLink 2 signing, which only its owner may read (chmod 600): 64 "
@@ -520,8 +514,53 @@ class MavlinkSettings:
     )
     signing_state: str = setting(
         "",
-        "Folder where the last timestamp is kept over restarts; empty: the service's state directory, "
-        "/var/lib/locagen-edge under systemd, else ~/.local/state/locagen-edge.",
+        "Folder where the last timestamp, and parameters that were set over MAVLink, are kept over restarts; "
+        "empty: the service's state directory, /var/lib/locagen-edge under systemd, else "
+        "~/.local/state/locagen-edge.",
+    )
+    send_records: bool = setting(
+        True, "LOCAGEN_BEARING and LOCAGEN_POSITION: the whole record at once, for programs that know them."
+    )
+    send_tunnel: bool = setting(
+        True, "The same records inside TUNNEL, for paths that drop messages they do not know."
+    )
+    send_adsb: bool = setting(
+        False,
+        "A caller's position as ADSB_VEHICLE, which every ground station draws on its map. With an "
+        "autopilot that avoids traffic (ArduPilot's ADSB_TYPE above 0) it acts on flight: leave it off.",
+    )
+    send_camera_target: bool = setting(
+        False, "A caller's position as CAMERA_TRACKING_GEO_STATUS, as of a camera that tracks it."
+    )
+    send_computer_status: bool = setting(
+        False, "ONBOARD_COMPUTER_STATUS, every 2 s: load, memory, temperature, disk."
+    )
+
+
+@dataclass(frozen=True)
+class FlightSettings:
+    """What may act on flight. All of it is off, and only this file can switch it on: no parameter does."""
+
+    roi: bool = setting(
+        False, "Point camera or nose at a caller's position: MAV_CMD_DO_SET_ROI_LOCATION, in `flight.modes`."
+    )
+    yaw: bool = setting(False, "Turn the nose towards a caller: MAV_CMD_CONDITION_YAW, in `flight.modes`.")
+    modes: tuple[str, ...] = setting(
+        ("GUIDED",),
+        "Flight modes, by ArduCopter's names (GUIDED, AUTO, LOITER, ...) or PX4's (HOLD, MISSION), in which "
+        "either may be sent. MAV_CMD_CONDITION_YAW goes to ArduCopter alone.",
+        choices=("GUIDED", "AUTO", "LOITER", "POSHOLD", "HOLD", "MISSION"),
+    )
+    every_s: float = setting(10.0, "Least time between two such commands.", unit="s", least=2, most=3600)
+    turn_deg: float = setting(
+        15.0,
+        "A command is repeated only where the bearing has moved by so much.",
+        unit="degrees",
+        least=1,
+        most=180,
+    )
+    sigma_deg: float = setting(
+        10.0, "Largest 1-sigma of a true azimuth that is turned to.", unit="degrees", least=0.1, most=60
     )
 
 
@@ -634,6 +673,7 @@ class Settings:
     position: PositionSettings = PositionSettings()
     models: ModelsSettings = ModelsSettings()
     mavlink: MavlinkSettings = MavlinkSettings()
+    flight: FlightSettings = FlightSettings()
     daemon: DaemonSettings = DaemonSettings()
     record: RecordSettings = RecordSettings()
     log: LogSettings = LogSettings()

@@ -7,7 +7,7 @@ import json
 import socket
 import sys
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +35,22 @@ class Peer:
         return [message for message in self.heard if message.get("name") == name]
 
 
+def mavsdk(role: str, url: str) -> AbstractAsyncContextManager[Peer]:
+    """MAVSDK that listens: `mavlink/mavsdk_peer.py`."""
+    return _script("mavsdk_peer.py", role, url)
+
+
+def operator(url: str) -> AbstractAsyncContextManager[Peer]:
+    """MAVSDK that sets parameters and commands: `mavlink/mavsdk_operator.py`."""
+    return _script("mavsdk_operator.py", url)
+
+
 @asynccontextmanager
-async def mavsdk(role: str, url: str) -> AsyncIterator[Peer]:
+async def _script(name: str, *arguments: str) -> AsyncIterator[Peer]:
     process = await asyncio.create_subprocess_exec(
         sys.executable,
-        str(Path(__file__).parent / "mavlink" / "mavsdk_peer.py"),
-        role,
-        url,
+        str(Path(__file__).parent / "mavlink" / name),
+        *arguments,
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.DEVNULL,

@@ -73,3 +73,10 @@ def test_framer(tmp_path):
     for result in found["results"].values():
         assert result["kept"]["framer"] >= found["goals"]["kept"]
         assert 0 < result["ratio"]["min"] <= result["ratio"]["median"]
+
+
+def test_detection(tmp_path):
+    report = run("bench_detection.py", tmp_path)
+    assert set(report["noise_alone"]) == {"steady", "hunting"}
+    assert all(noise["hours"] > 0 for noise in report["noise_alone"].values())
+    assert all(0.0 <= cell["found"] <= 1.0 for cell in report["calls"].values())

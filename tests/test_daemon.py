@@ -112,7 +112,7 @@ def port_of(server: socket.socket) -> int:
 
 
 def test_sound_goes_in_and_a_bearing_comes_out(ground):
-    settings = with_link(port_of(ground), detection={"snr_db": -20})
+    settings = with_link(port_of(ground), detection={"snr_db": -20}, bearing={"estimator": "far-field"})
 
     async def call_after_noise(_: Settings) -> AsyncGenerator[Frame, None]:
         quiet = 1e-4 * np.random.default_rng(0).standard_normal((3, 1024)).astype(np.float32)
@@ -139,7 +139,7 @@ def test_sound_goes_in_and_a_bearing_comes_out(ground):
 
 def test_with_an_autopilot_on_the_link_the_bearing_is_from_true_north(ground):
     """The autopilot answers what it is asked for: nose to the west, level, 20 m over the ground."""
-    settings = with_link(port_of(ground), detection={"snr_db": -20})
+    settings = with_link(port_of(ground), detection={"snr_db": -20}, bearing={"estimator": "far-field"})
     frames = steady(settings)
     quiet = 1e-4 * np.random.default_rng(0).standard_normal((3, 1024)).astype(np.float32)
 
@@ -523,7 +523,9 @@ def start(*arguments: str) -> subprocess.Popen[str]:
 @pytest.fixture
 def settings_file(tmp_path, ground):
     path = tmp_path / "settings.toml"
-    path.write_text(f'[mavlink]\nlink = "udpout:127.0.0.1:{port_of(ground)}"\n')
+    path.write_text(
+        f'[mavlink]\nlink = "udpout:127.0.0.1:{port_of(ground)}"\n[bearing]\nestimator = "far-field"\n'
+    )
     return str(path)
 
 

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locagen_edge.errors import DatasetError, ModelError
-from locagen_edge.lab.denoise import evaluate, sounds
+from locagen_edge.geometry import direction
+from locagen_edge.lab.denoise import bearings, evaluate, sounds
 from locagen_edge.lab.denoise.callers import CALLERS
 from locagen_edge.lab.denoise.cases import Case, cases, with_array
 from locagen_edge.lab.denoise.mixes import Mixer, length
@@ -20,6 +21,7 @@ from locagen_edge.lab.nets.mask import BINS, LOOKAHEAD, MaskNet
 from locagen_edge.lab.nets.wave import STRIDE, WaveNet
 from locagen_edge.lab.settings import LabSettings, read
 from locagen_edge.models import default_directory, load_network
+from locagen_edge.sim.levels import band_power, to_db
 from locagen_edge.stages.denoise import RATE_HZ
 
 MOST_PARAMETERS = 100_000
@@ -266,3 +268,28 @@ def test_a_case_says_where_its_call_is() -> None:
     sound, clean = one.mixture(0.0)
     np.testing.assert_allclose(sound[-1024:], clean)
     assert clean[0] == pytest.approx(10.0 ** (-30.0 / 20.0))
+
+
+# --- bearings -----------------------------------------------------------------------------------------
+
+
+def test_sound_for_bearings_has_its_snr_and_its_direction(small) -> None:
+    s = read(small)
+    (event,) = bearings.events(s, 1)
+    u = direction(event.azimuth_rad, bearings.ELEVATION_RAD)
+    for field in bearings.FIELDS:
+        noise, call = bearings.sound_of(s, event, field)
+        n = len(event.call)
+        assert noise.shape == call.shape
+        assert not call[:, :-n].any()
+        powers = [band_power(sound[:, -n:], s.audio.rate_hz) for sound in (noise, call)]
+        assert to_db(powers[0]) == pytest.approx(to_db(powers[1])) == pytest.approx(bearings.LEVEL_DBFS)
+    p = s.mic_array.positions_m
+    assert_delays(call[:, -n:], np.array([(p[i] - p[j]) @ u for i, j in s.mic_array.pairs]) / s.speed_m_s, s)
+
+
+def test_the_confidence_interval_is_wilsons() -> None:
+    low, high = bearings.wilson(5, 10)
+    assert (low, high) == pytest.approx((0.2366, 0.7634), abs=1e-4)  # Brown, Cai & DasGupta (2001), p = 1/2
+    assert bearings.wilson(0, 10)[0] == pytest.approx(0.0, abs=1e-12)
+    assert bearings.wilson(10, 10)[1] == pytest.approx(1.0)

@@ -10,7 +10,7 @@ import soundfile
 import torch
 
 from locagen_edge.lab.cli import main
-from locagen_edge.lab.denoise import evaluate, sounds
+from locagen_edge.lab.denoise import bearings, evaluate, sounds
 from locagen_edge.lab.denoise.callers import CALLERS
 from locagen_edge.lab.denoise.publish import weights_of
 from locagen_edge.lab.settings import read
@@ -118,6 +118,22 @@ def test_the_evaluation_tells_all(runs, small, tmp_path, monkeypatch) -> None:
     text = (out / "report.md").read_text()
     assert "nan" not in text
     assert all(f"({name})" in text for name in names if name.endswith(".png"))
+
+
+def test_the_bearings_are_told(small, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(bearings, "BEFORE_S", 2.0)
+    monkeypatch.setattr(bearings, "SNRS_DB", (30.0,))
+    out = tmp_path / "report"
+    assert lab("denoise", "evaluate", "--settings", small, "--bearings", 1, "--out", out) == 0
+    assert {path.name for path in out.iterdir()} == {"bearings.md", "bearings.json", "bearings.png"}
+    fields = json.loads((out / "bearings.json").read_text())["fields"]
+    assert set(fields) == set(bearings.FIELDS)
+    assert all(
+        set(table) == set(bearings.METHODS) for lengths in fields.values() for table in lengths.values()
+    )
+    # no drone is as loud as this call, and PHAT needs no noise before
+    assert all(lengths["1"]["PHAT"]["30"]["right"] == 1.0 for lengths in fields.values())
+    assert "nan" not in (out / "bearings.md").read_text()
 
 
 def test_own_drone(runs, small, tmp_path, capsys) -> None:

@@ -81,6 +81,7 @@ ABOVE = {
     "sightings": GROUND | {"export"},
     "fusion": GROUND | {"stages"},
     "notify": set(),
+    "mavproxy_locagen": GROUND | {"mavlink"},  # loaded by MAVProxy alone
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},
     "check": GROUND | {"stages", "mavlink", "pipeline", "sources"},

@@ -99,3 +99,20 @@ def test_a_loud_caller_is_where_he_is(kind: str) -> None:
     last = heard_by(kind, np.concatenate([noise, call], axis=1))[-1]
     assert last.detection.call
     assert error_deg(last.bearing, 0.7) < 3.0
+
+
+def test_a_denoiser_comes_and_goes_in_flight() -> None:
+    """Changed between two frames, it says from then on what it would have said from the beginning."""
+    sound = heard(SETTINGS, 0.7, -0.3, 15.0, 2 * RATE_HZ)
+    by_wave = {"denoise": {"kind": "wave"}, "bearing": {"estimator": "far-field"}}
+    plain, wave = from_table(by_wave | {"denoise": {"kind": "none"}}), from_table(by_wave)
+    pipeline, always = Pipeline(plain), Pipeline(wave)
+    for frame in cut(SETTINGS, sound[:, :RATE_HZ]):
+        pipeline.process(frame)
+    pipeline.apply(wave)
+    for frame in cut(SETTINGS, sound[:, RATE_HZ:]):
+        changed, fresh = pipeline.process(frame), always.process(frame)
+    np.testing.assert_array_equal(changed.tdoa.delay_s, fresh.tdoa.delay_s)
+    pipeline.apply(plain)
+    last = pipeline.process(frame)
+    np.testing.assert_array_equal(last.tdoa.delay_s, Pipeline(plain).process(frame).tdoa.delay_s)

@@ -371,6 +371,63 @@ def test_silence_is_no_call_and_has_no_bearing():
         assert estimate.track is None
 
 
+def never_sure_and_wrong(estimates: list[Estimate], azimuth: float) -> None:
+    """A bearing is within 3 of its sigmas and 15 degrees of the truth, or wide, or there is none."""
+    for estimate in estimates:
+        finite(estimate)
+        b = estimate.bearing
+        if b.azimuth_rad is not None and b.azimuth_sigma_rad < math.radians(20.0):
+            off = abs(wrap(b.azimuth_rad - azimuth))
+            assert off < max(3.5 * b.azimuth_sigma_rad, math.radians(3.0)), estimate
+
+
+@pytest.mark.parametrize("mic", [0, 1, 2])
+def test_a_channel_that_dies_in_flight_gives_no_sure_wrong_bearing(mic):
+    """In the midst of a call: two microphones that are left have a mirror image for every answer."""
+    settings = Settings()
+    sound = after_noise(settings, heard(settings, 1.0, -0.3, 15.0, 20_000), 15.0, hops=80)
+    sound[mic, -12_000:] = 0.0
+    estimates = process(settings, sound)
+    never_sure_and_wrong(estimates[90:], 1.0)
+    assert estimates[-1].faults == (f"microphone {mic}: dead, hears nothing",)
+
+
+def test_a_whistle_is_a_call_without_a_sure_wrong_bearing():
+    """3 kHz: 10 cm are nearly a wavelength, and several directions explain it alike."""
+    settings = Settings()
+    rate = settings.audio.rate_hz
+    noise = 0.05 * np.random.default_rng(1).standard_normal((3, 8 * rate)).astype(np.float32)
+    for azimuth in (0.5, 2.5, 4.4):
+        call = CALLS["whistle"](rate, rate, 4800.0, np.random.default_rng(2))
+        mixed = call_over_noise(settings, call, noise, rate, 6.0, azimuth, 0.0).astype(np.float32)
+        inside = [e for e in process(settings, mixed) if 6.0 <= e.t_ns * 1e-9 < 6.9]
+        assert np.mean([e.detection.call for e in inside]) > 0.9
+        never_sure_and_wrong(inside, azimuth)
+
+
+def test_a_source_straight_below_has_no_azimuth_to_be_sure_of():
+    settings = Settings()
+    sound = after_noise(settings, heard(settings, 1.0, -math.pi / 2, 15.0, 8192), 15.0, hops=80)
+    bearings = [e.bearing for e in process(settings, sound)[82:]]
+    assert all(b.azimuth_rad is None or b.azimuth_sigma_rad > math.radians(10.0) for b in bearings)
+    known = [b.elevation_rad for b in bearings if b.elevation_rad is not None]
+    assert known
+    assert np.degrees(known).max() < -75.0
+
+
+def test_a_frame_after_a_gap_holds_nothing_of_what_was_before():
+    """A caller to the right, a minute unheard, a caller to the left."""
+    settings = Settings()
+    pipeline = Pipeline(settings)
+    right = after_noise(settings, heard(settings, 1.5, -0.3, 15.0, 16_384), 15.0, hops=80)
+    for frame in cut(settings, right):
+        pipeline.process(frame)
+    left = cut(settings, heard(settings, -1.5, -0.3, 15.0, 8192, seed=1))
+    estimates = [pipeline.process(replace(f, t_ns=f.t_ns + 70 * 10**9, overruns=1)) for f in left]
+    never_sure_and_wrong(estimates, -1.5)
+    assert any(e.bearing.azimuth_rad is not None for e in estimates)
+
+
 # --- what is wrong with the microphones
 
 

@@ -635,3 +635,152 @@ def test_refuses_wrong_shares_and_counts() -> None:
             found.hear(share)
     with pytest.raises(KernelError, match="sources"):
         found.search(0)
+
+
+# --- several averages, a lag, and a constant false-alarm rate
+
+
+def hunting(rng: np.random.Generator, azimuth: float, loud: bool) -> np.ndarray:
+    """Hiss, and a rotor from one side that is now and then much louder, in one part of the band."""
+    return hiss(rng) + wave(rng, azimuth, level=0.06 if loud else 0.01, band_hz=(2000.0, 2600.0))
+
+
+def listened(found: Steered, samples: np.ndarray, share: float) -> tuple[Source, ...]:
+    """Noise as it flies: heard, searched, watched, learnt."""
+    listen(found, samples)
+    found.hear()
+    sources = found.search()
+    found.watch()
+    found.settle(share)
+    found.learn(share)
+    return sources
+
+
+def test_noise_that_strays_scores_no_higher_than_noise_that_keeps_still() -> None:
+    """The rotor's own side and band lose their looks; a call from elsewhere, in other bands, loses little."""
+    best = {}
+    for watched in (False, True):
+        rng = np.random.default_rng(0)
+        found = steered()
+        scores = []
+        for n in range(300):
+            samples = hunting(rng, 1.0, loud=rng.uniform() < 0.1)
+            if watched:
+                sources = listened(found, samples, 0.02)
+            else:
+                listen(found, samples)
+                found.hear()
+                sources = found.search()
+                found.learn(0.02)
+            if n >= 150:
+                scores.append(sources[0].score)
+        (call,) = heard(found, hunting(rng, 1.0, loud=False) + wave(rng, 3.5, -0.5, level=0.02))
+        best[watched] = max(scores), call.score
+        assert apart(call, 3.5, -0.5) < 3.0
+    assert best[True][0] < 0.3 * best[False][0]
+    assert best[True][1] > 0.6 * best[False][1]
+
+
+def test_in_still_noise_watching_changes_little() -> None:
+    rng = np.random.default_rng(1)
+    found, plain = steered(), steered()
+    for n in range(300):
+        samples = hiss(rng)
+        if n < 60:  # a matrix from few frames strays more than theory says
+            listen(found, samples)
+            found.learn(0.01)
+        else:
+            listened(found, samples, 0.01)
+        listen(plain, samples)
+        plain.learn(0.01)
+    call = hiss(rng) + wave(rng, 2.0, -0.6, level=0.02)
+    (a,), (b,) = heard(found, call), heard(plain, call)
+    assert a.score == pytest.approx(b.score, rel=0.15)
+    assert a.azimuth_rad == pytest.approx(b.azimuth_rad, abs=math.radians(0.2))
+
+
+def test_what_is_doubted_is_not_kept_in_mind() -> None:
+    """A call that was watched before it was known leaves no trace, once it is doubted."""
+    rng = np.random.default_rng(2)
+    scores = {}
+    for doubted in (False, True):
+        found = steered()
+        for _ in range(100):
+            listened(found, hiss(rng), 0.02)
+        for _ in range(3):
+            listen(found, hiss(rng) + wave(rng, 2.0, -0.6, level=0.03))
+            found.hear()
+            found.search()
+            found.watch()
+        if doubted:
+            found.doubt()
+        found.settle(0.02)
+        found.settle(0.02)
+        scores[doubted] = heard(found, hiss(rng) + wave(rng, 2.0, -0.6, level=0.03))[0].score
+    assert scores[False] < 0.5 * scores[True]
+
+
+def test_louder_noise_is_no_source() -> None:
+    rng = np.random.default_rng(3)
+    found = steered()
+    learn(found, [hiss(rng) for _ in range(100)])
+    (louder,) = heard(found, hiss(rng, level=0.02))
+    (call,) = heard(found, hiss(rng) + wave(rng, 1.0, level=0.02))
+    assert louder.score > 100.0  # likely no more, by itself
+    assert louder.contrast < -louder.score
+    assert call.contrast > 0.0
+
+
+@pytest.mark.parametrize("lag", [0, 1, 10, 64])
+def test_learning_lags_and_spans_keep_apart(lag: int) -> None:
+    """After n frames the noise holds those up to n - lag, and each span what it was told to hear."""
+    rng = np.random.default_rng(4)
+    found, plain = steered(lag=lag, spans=2), steered()
+    frames = [hiss(rng) for _ in range(lag + 5)]
+    for samples in frames:
+        listen(found, samples)
+        found.learn(0.5)
+        found.hear(1.0, span=0)
+        found.hear(0.25, span=1)
+    for samples in frames[:5]:
+        listen(plain, samples)
+        plain.learn(0.5)
+    np.testing.assert_allclose(found.noise(), plain.noise(), rtol=1e-5, atol=1e-12)
+    listen(found, hiss(rng) + wave(rng, 1.0))
+    found.hear(1.0, span=0)
+    found.hear(0.25, span=1)
+    one, many = found.search(span=0)[0], found.search(span=1)[0]
+    assert one.score != many.score
+
+
+def test_weights_choose_the_bins_that_count() -> None:
+    """Half of the band without weight: the answer is that of an array that never heard it."""
+    rng = np.random.default_rng(5)
+    whole, low = steered(), steered(band_hz=(300.0, 2000.0))
+    for _ in range(60):
+        samples = hiss(rng)
+        for found in (whole, low):
+            listen(found, samples)
+            found.learn(0.05)
+    whole.weigh((whole.frequency_hz <= 2000.0).astype(np.float32))
+    call = hiss(rng) + wave(rng, 1.0, -0.4, level=0.02)
+    (a,), (b,) = heard(whole, call), heard(low, call)
+    assert a.score == pytest.approx(b.score, rel=0.03)  # the averages at the edge differ
+    assert a.azimuth_rad == pytest.approx(b.azimuth_rad, abs=math.radians(0.5))
+    for wrong in (np.full(len(whole.frequency_hz), 1.5), np.full(len(whole.frequency_hz), np.nan)):
+        with pytest.raises(KernelError, match="weights"):
+            whole.weigh(wrong.astype(np.float32))
+    with pytest.raises(KernelError, match="float32"):
+        whole.weigh(np.ones(3, np.float32))
+
+
+def test_a_narrow_sound_of_short_waves_has_rivals() -> None:
+    """At 3 kHz 10 cm are 0.9 wavelengths: a whistle has several answers, a voice one."""
+    rng = np.random.default_rng(6)
+    found = steered()
+    learn(found, [hiss(rng) for _ in range(100)])
+    for azimuth in (0.3, 2.0, 4.5):
+        (whistle,) = heard(found, hiss(rng) + wave(rng, azimuth, -0.4, level=0.03, band_hz=(2950.0, 3050.0)))
+        (voice,) = heard(found, hiss(rng) + wave(rng, azimuth, -0.4, level=0.03, band_hz=(400.0, 2500.0)))
+        assert whistle.rival > 0.93
+        assert voice.rival < 0.8

@@ -13,11 +13,14 @@ The profile, for any ground station and autopilot as they are:
   tell), LG_SIG (1-sigma of the azimuth, degrees: of LG_AZ where it is sent, compass and all), LG_CONF (0 to
   1), LG_SNR (dB, in-band).
 - LOCAGEN_BEARING at the same rate for the best track and every other confirmed one, LOCAGEN_POSITION for
-  those whose place is known; once a second that nothing is heard. As messages and inside TUNNEL
-  (`mavlink.records`).
+  those whose place is known; once a second that nothing is heard. As messages and inside TUNNEL.
 - STATUSTEXT once per confirmed call, once when its place is known, once per fault and once when a fault has
-  gone.
-- COMMAND_LONG to the autopilot, to have its attitude and position sent: never any other command.
+  gone, in chunks where it is long; and how many had to be left out, where they came too fast.
+- COMMAND_LONG to the autopilot, to have its attitude and position sent: never any other command, unless the
+  settings file switches on what acts on flight (`flight.py`).
+- TIMESYNC, asked of the autopilot and answered (`timesync.py`).
+- Answers to parameters (`parameters.py`) and commands (`commands.py`), to the link that asked.
+- What the switches `mavlink.send_...` let out; nothing that is not in `dialect.SENT` ever leaves.
 
 ArduPilot forwards HEARTBEAT, NAMED_VALUE_FLOAT, TUNNEL and STATUSTEXT between its links, and writes values
 and texts into its log. Times are monotonic
@@ -36,13 +39,20 @@ from typing import Any
 
 from locagen_edge.geodesy import north_east_down_m
 from locagen_edge.geometry import compass_deg
-from locagen_edge.mavlink import dialect
+from locagen_edge.mavlink import dialect, parameters, timesync
+from locagen_edge.mavlink.commands import Commands
+from locagen_edge.mavlink.flight import Interlock
 from locagen_edge.mavlink.framer import Framer, Packet
+from locagen_edge.mavlink.identity import version_message
+from locagen_edge.mavlink.pace import Every
+from locagen_edge.mavlink.parameters import Parameters
 from locagen_edge.mavlink.pose import READ, PoseHistory
 from locagen_edge.mavlink.records import BearingRecord, PositionRecord, bearing_message, position_message
 from locagen_edge.mavlink.signing import Guard
-from locagen_edge.mavlink.streams import Streams
-from locagen_edge.settings import MavlinkSettings, PoseSettings
+from locagen_edge.mavlink.streams import GAP_S, Streams
+from locagen_edge.mavlink.targets import Place, adsb_vehicle, camera_target
+from locagen_edge.mavlink.timesync import SyncedClock
+from locagen_edge.settings import MavlinkSettings, PoseSettings, Settings
 from locagen_edge.types import Pose, Position, Track
 
 HEARTBEAT_S = 1.0
@@ -61,7 +71,12 @@ NOTHING_S = 1.0
 CALLS_REMEMBERED = 16
 """tracks of which the operator was told; more than can be followed at a time"""
 TEXTS_WAITING = 8
-"""texts that may wait, 4 s of them; beyond that the newest is dropped and counted"""
+"""texts that may wait, 4 s of them; beyond that the newest is dropped, counted, and the number told after"""
+REFUSED_S = 5.0
+"""the same refusal of a parameter is told once in this time"""
+PLACES_S = 1.0
+COMPUTER_S = 2.0
+"""how often callers' places are told as traffic and as a target, and how the computer does"""
 ANSWERS_AT_ONCE = 10
 """answers to a link at a time, 100 a second: a radio link carries no more"""
 ANSWERS_WAITING = 64
@@ -69,6 +84,10 @@ ANSWERS_WAITING = 64
 
 _FIRST_SYSTEM_ID = 1  # until the autopilot is heard; every autopilot's default
 _GROUND_STATION_ID = 255
+
+
+Moment = tuple[int, bool]
+"""microseconds, and whether they are on the autopilot's clock"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,15 +115,50 @@ class Status:
 
     def place(self, track: Track) -> Position | None:
         """Where the caller of this track is; None too where no range is observable."""
-        found = (p for p in self.positions if p.caller == track.id and p.latitude_deg is not None)
-        return next(found, None)
+        return next((p for p in self._on_earth if p.caller == track.id), None)
+
+    @property
+    def _on_earth(self) -> Iterator[Position]:
+        for p in self.positions:
+            known = p.latitude_deg is not None and p.longitude_deg is not None
+            if known and abs(p.latitude_deg or 0.0) <= 90.0 and abs(p.longitude_deg or 0.0) <= 180.0:
+                yield p
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """Of all callers whose place is known."""
+        return tuple(
+            Place(
+                p.caller, p.latitude_deg or 0.0, p.longitude_deg or 0.0, p.altitude_m, p.semi_major_m, p.age_s
+            )
+            for p in self._on_earth
+        )
+
+
+def _nothing(*_: Any) -> None:
+    """What a component without a daemon around it does."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hands:
+    """What others may ask of the daemon through the component. None of it may wait or raise."""
+
+    apply: Callable[[Settings], None] = _nothing
+    """these settings hold from now on"""
+    listen: Callable[[bool], None] = _nothing
+    forget_noise: Callable[[], None] = _nothing
+    computer: Callable[[int], Any] = _nothing
+    """ONBOARD_COMPUTER_STATUS at a monotonic time (ns)"""
+    uid: int = 0
+    """of this computer"""
 
 
 class Component:
     """Collects what is heard on the link, and says what is due.
 
     `start_s` is the moment from which `time_boot_ms` counts; with 0 and Linux's monotonic clock that is
-    the computer's boot, which is what the field is called.
+    the computer's boot, which is what the field is called. `whole`: all settings, for what can be changed by
+    parameters, and `base`: as the file has them, without what was changed before.
     """
 
     def __init__(
@@ -113,7 +167,20 @@ class Component:
         start_s: float = 0.0,
         pose: PoseSettings | None = None,
         guard: Guard | None = None,
+        *,
+        whole: Settings | None = None,
+        base: Settings | None = None,
+        hands: Hands | None = None,
     ) -> None:
+        whole = whole or Settings(mavlink=settings, pose=pose or PoseSettings())
+        self.parameters = Parameters(whole, base)
+        self.listening = True
+        """False: told to stop"""
+        self._hands = hands or Hands()
+        self._commands = Commands(self)
+        self._interlock = Interlock(whole.flight)
+        self._allowed = _allowed(settings)
+        self._last: dict[int, Any] = {}
         self.guard = guard or Guard()
         """who may speak to us"""
         self._fixed_id = settings.system_id
@@ -121,19 +188,23 @@ class Component:
         self.received: defaultdict[int, Framer] = defaultdict(Framer)
         """the framers by link, for their counters"""
         self._answers: defaultdict[int, deque[bytes]] = defaultdict(lambda: deque(maxlen=ANSWERS_WAITING))
-        self._sender = dialect.Sender(self._fixed_id or _FIRST_SYSTEM_ID, settings.component_id)
-        self._heartbeat = _Every(HEARTBEAT_S)
-        self._values = _Every(1.0 / settings.rate_hz)
-        self._ways = [WAYS[way] for way in settings.records]
-        self._bearings, self._nothing = _Every(1.0 / settings.rate_hz), _Every(NOTHING_S)
-        self._text = _Every(TEXT_S)
+        self._sender = dialect.Sender(
+            self._fixed_id or _FIRST_SYSTEM_ID,
+            settings.component_id,
+            dialect.COMMANDS | self._interlock.commands,
+        )
+        self._every = {id: Every(period_s) for id, period_s in _periods(settings).items()}
+        self._nothing = Every(NOTHING_S)
+        self._text = Every(TEXT_S)
         self._texts: deque[tuple[int, str]] = deque()
         self._faults: dict[str, float] = {}  # told, and when each was last there
         self._told: deque[int] = deque(maxlen=CALLS_REMEMBERED)
         self._placed: deque[int] = deque(maxlen=CALLS_REMEMBERED)
         pose = pose or PoseSettings()
         self._streams = Streams(pose.rate_hz)
-        self.poses = PoseHistory(pose)
+        self.clock = SyncedClock()
+        """the autopilot's"""
+        self.poses = PoseHistory(pose, self.clock)
         """where the vehicle was, as its autopilot tells"""
         self.autopilot_heard_s: float | None = None
         """when the autopilot's last heartbeat came"""
@@ -141,6 +212,14 @@ class Component:
         """frames made, by name: HEARTBEAT, STATUSTEXT, LG_AZB, ..."""
         self.texts_dropped = 0
         """texts for which the queue had no room"""
+        self._dropped_told = 0
+        self._refused = "", -math.inf
+        self._text_number = 0
+
+    @property
+    def settings(self) -> Settings:
+        """With all parameters as they are now."""
+        return self.parameters.settings
 
     @property
     def system_id(self) -> int:
@@ -155,22 +234,24 @@ class Component:
             if not self.guard.admit(packet, now_s):
                 continue
             if packet.message_id == dialect.HEARTBEAT and _is_autopilot(packet):
-                self._hear_autopilot(packet.system_id, now_s)
+                self._hear_autopilot(packet, now_s)
             elif packet.message_id == dialect.COMMAND_ACK:
-                self._hear_answer(packet)
-            elif packet.message_id == dialect.PING:
-                self._hear_ping(packet, link)
+                self._hear_answer(packet, now_s)
+            elif packet.message_id in _REQUESTS:
+                _REQUESTS[packet.message_id](self, packet, dialect.decode(packet.raw), link, now_s)
             elif packet.message_id in READ:
                 self._hear_pose(packet, now_s)
 
-    def _hear_autopilot(self, system_id: int, now_s: float) -> None:
-        if system_id != (self._fixed_id or self.system_id):
+    def _hear_autopilot(self, packet: Packet, now_s: float) -> None:
+        if packet.system_id != (self._fixed_id or self.system_id):
             silent = self.autopilot_heard_s is None or now_s - self.autopilot_heard_s > AUTOPILOT_SILENT_S
             if self._fixed_id or not silent:
                 return  # another vehicle on the same network
-            self._sender.system_id = system_id
+            self._sender.system_id = packet.system_id
+            self.clock.forget()
         self.autopilot_heard_s = now_s
         self._streams.hear_heartbeat(now_s)
+        self._interlock.hear_heartbeat(dialect.decode(packet.raw), now_s)
 
     def _hear_pose(self, packet: Packet, now_s: float) -> None:
         """A message about the vehicle, from the autopilot whose heartbeat we follow."""
@@ -182,28 +263,139 @@ class Component:
         if self.poses.reboots > reboots:
             self._streams.ask_all()
 
-    def _hear_answer(self, packet: Packet) -> None:
+    def _hear_answer(self, packet: Packet, now_s: float) -> None:
         """The autopilot answers; older firmware names no target."""
         message = dialect.decode(packet.raw)
         if packet.system_id == self.system_id and message.target_component in (0, self._sender.component_id):
             self.guard.answered()
+            if packet.component_id == dialect.COMPONENT_AUTOPILOT and (
+                text := self._interlock.hear_answer(message, now_s)
+            ):
+                self._say(dialect.SEVERITY_WARNING, text)
 
-    def _hear_ping(self, packet: Packet, link: int) -> None:
+    def _hear_ping(self, packet: Packet, message: Any, link: int, _: float) -> None:
         """A ping at nobody in particular asks all to answer it to its sender."""
-        message = dialect.decode(packet.raw)
         if message.target_system == 0 and message.target_component == 0:
-            answer = dialect.ping(message, packet.system_id, packet.component_id)
-            self._answers[link].append(self._pack("PING", answer))
+            self._answer(link, dialect.ping(message, packet.system_id, packet.component_id))
+
+    def _hear_timesync(self, packet: Packet, message: Any, link: int, now_s: float) -> None:
+        now_ns = round(now_s * 1e9)
+        if answer := timesync.answer(message, now_ns):
+            self._answer(link, answer)
+        elif (packet.system_id, packet.component_id) == (self.system_id, dialect.COMPONENT_AUTOPILOT):
+            self.clock.answered(message, now_ns)
+
+    def _hear_list(self, _: Packet, message: Any, link: int, __: float) -> None:
+        if self._is_ours(message) or self._is_to_all(message):
+            self.parameters.list_to(link)
+
+    def _hear_read(self, _: Packet, message: Any, link: int, __: float) -> None:
+        if self._is_ours(message):
+            self._answer(link, *self.parameters.read(message))
+
+    def _hear_set(self, _: Packet, message: Any, link: int, now_s: float) -> None:
+        if not self._is_ours(message):
+            return
+        before = self.settings
+        answers, fault = self.parameters.set(message)
+        self._answer(link, *answers)
+        if fault and (fault != self._refused[0] or now_s - self._refused[1] > REFUSED_S):
+            self._say(dialect.SEVERITY_WARNING, fault)
+            self._refused = fault, now_s  # who is refused asks again, five times over
+        if self.settings != before:
+            self._follow_settings(before)
+            self._hands.apply(self.settings)
+
+    def _hear_file(self, packet: Packet, message: Any, link: int, _: float) -> None:
+        if self._is_ours(message):
+            answer = parameters.no_files(message, packet.system_id, packet.component_id)
+            self._answer(link, *([answer] if answer else []))
+
+    def _hear_command(self, packet: Packet, message: Any, link: int, now_s: float) -> None:
+        sender = (packet.system_id, packet.component_id)
+        ours = self._is_ours(message)
+        if ours or self._is_to_all(message):
+            self._answer(link, *self._commands.obey(message, sender, now_s, to_all=not ours))
+
+    def _is_ours(self, message: Any) -> bool:
+        target = (message.target_system, message.target_component)
+        return target == (self.system_id, self._sender.component_id)
+
+    def _is_to_all(self, message: Any) -> bool:
+        return (message.target_system, message.target_component) == (self.system_id, 0)
+
+    # --- what commands act on (commands.Desk) ---------------------------------------------------------
+
+    def listen(self, on: bool, /) -> None:
+        """Starts or stops listening."""
+        if on != self.listening:
+            self.listening = on
+            text = "Listening again" if on else "Stopped listening, as commanded"
+            self._say(dialect.SEVERITY_NOTICE, text)
+            self._hands.listen(on)
+
+    def forget_noise(self) -> None:
+        """Starts learning the noise from nothing."""
+        self._say(dialect.SEVERITY_NOTICE, "Learning the noise anew, as commanded")
+        self._hands.forget_noise()
+
+    def requested(self, message_id: int, /) -> Any | None:
+        """A message of ours that may be asked for once."""
+        if message_id == dialect.AUTOPILOT_VERSION:
+            return version_message(self._hands.uid)
+        return self._last.get(message_id) if message_id in self._allowed else None
+
+    def interval_s(self, message_id: int, /) -> float | None:
+        """How often a message of ours is sent; infinite: it is switched off; None: none of ours."""
+        if message_id not in self._every:
+            return None
+        return self._every[message_id].period_s if message_id in self._allowed else math.inf
+
+    def set_interval(self, message_id: int, period_s: float | None, /) -> bool:
+        """None: as the settings say. False: it is none that can be set."""
+        if message_id not in self._every or message_id == dialect.HEARTBEAT:
+            return False  # the heartbeat's second is what others judge us by
+        default_s = _periods(self.settings.mavlink)[message_id]
+        self._every[message_id].period_s = default_s if period_s is None else period_s
+        return True
+
+    def put_back(self, settings: Settings, why: str) -> None:
+        """The pipeline could not be made for what a parameter asked: these settings hold."""
+        before = self.settings
+        for message in self.parameters.put_back(settings):
+            for link in self.received:
+                self._answer(link, message)
+        self._follow_settings(before)
+        self._say(dialect.SEVERITY_WARNING, why)
+
+    def tell_fault(self, text: str) -> None:
+        """Something that the daemon could not do."""
+        self._say(dialect.SEVERITY_WARNING, text)
+
+    def _follow_settings(self, before: Settings) -> None:
+        """What of them is the component's own."""
+        now, old = self.settings, _periods(before.mavlink)
+        self._allowed = _allowed(now.mavlink)
+        for id, period_s in _periods(now.mavlink).items():
+            if period_s != old[id]:
+                self._every[id].period_s = period_s
+        if now.pose.rate_hz != before.pose.rate_hz:
+            self._streams.rate_hz = now.pose.rate_hz
+            self._streams.ask_all()
 
     # --- out ------------------------------------------------------------------------------------------
 
     def due(self, now_s: float, status: Status) -> list[bytes]:
         """The frames to send now. Call it several times as often as `rate_hz`, at least 10 times a second."""
         self._follow_faults(now_s, (*status.faults, *self.guard.complaints(now_s)))
-        if status.hearing:
+        if status.hearing and self.listening:
             self._follow_call(status)
+        for link, value in self.parameters.due(now_s):
+            self._answer(link, value)
         frames = []
         for name, message in self._messages(now_s, status):
+            if message.get_msgId() not in self._allowed and message.get_msgId() != dialect.COMMAND_INT:
+                continue
             frames.append(self._pack(name, message))
             if name == "COMMAND_LONG":
                 self.guard.asked(now_s)
@@ -222,41 +414,90 @@ class Component:
         self._placed.clear()
 
     def _messages(self, now_s: float, status: Status) -> Iterator[tuple[str, Any]]:
-        if status.hearing and self._heartbeat.due(now_s):
-            state = dialect.STATE_CRITICAL if status.faults else dialect.STATE_ACTIVE
-            yield "HEARTBEAT", dialect.heartbeat(state)
+        if status.hearing and self._every[dialect.HEARTBEAT].due(now_s):
+            state = dialect.STATE_ACTIVE if self.listening else dialect.STATE_STANDBY
+            yield "HEARTBEAT", dialect.heartbeat(dialect.STATE_CRITICAL if status.faults else state)
         if status.hearing and (wanted := self._streams.due(now_s)) is not None:
             yield "COMMAND_LONG", dialect.set_message_interval(self.system_id, *wanted)
-        if self._texts and self._text.due(now_s):
-            yield "STATUSTEXT", dialect.statustext(*self._texts.popleft())
-        if status.hearing and status.track and self._values.due(now_s):
+        if self.autopilot_heard_s is not None and now_s - self.autopilot_heard_s < GAP_S:
+            asked = self.clock.ask(now_s, round(now_s * 1e9)) if status.hearing else None
+            if asked:
+                yield "TIMESYNC", asked
+        yield from self._due_texts(now_s)
+        if self._every[dialect.ONBOARD_COMPUTER_STATUS].due(now_s):
+            computer = self._hands.computer(round(now_s * 1e9))
+            if computer is not None:
+                yield "ONBOARD_COMPUTER_STATUS", computer
+        if not (status.hearing and self.listening):
+            return
+        if status.track and self._every[dialect.NAMED_VALUE_FLOAT].due(now_s):
             time_boot_ms = round((now_s - self._start_s) * 1000)
             for name, value in bearing_values(status.track, status.snr_db):
                 yield name, dialect.named_value_float(time_boot_ms, name, value)
-        if status.hearing and self._ways:
-            for message in self._records(now_s, status):
-                for name, as_sent in self._ways:
-                    yield name or message.get_type(), as_sent(message)
+        for message in self._records(now_s, status):
+            yield message.get_type(), message
+            yield "TUNNEL", dialect.tunnel(message)
+        yield from self._due_places(now_s, status.places)
+        called = status.track if status.track and is_confirmed(status.track) else None
+        for command, text in self._interlock.due(now_s, self.system_id, called, status.places):
+            self._say(dialect.SEVERITY_WARNING, text, first=True)
+            yield command.get_type(), command
+
+    def _due_texts(self, now_s: float) -> Iterator[tuple[str, Any]]:
+        if not self._texts and self.texts_dropped > self._dropped_told:
+            left_out = self.texts_dropped - self._dropped_told
+            self._dropped_told = self.texts_dropped
+            self._say(dialect.SEVERITY_INFO, f"{left_out} texts were left out: too many at once")
+        if self._texts and self._text.due(now_s):
+            self._text_number = self._text_number % 0xFFFF + 1
+            for chunk in dialect.statustexts(*self._texts.popleft(), self._text_number):
+                yield "STATUSTEXT", chunk
+
+    def _due_places(self, now_s: float, places: tuple[Place, ...]) -> Iterator[tuple[str, Any]]:
+        """All as traffic; of targets there is one, the surest."""
+        known = [place for place in places if place.somewhere]
+        if known and self._every[dialect.ADSB_VEHICLE].due(now_s):
+            for place in known:
+                yield "ADSB_VEHICLE", adsb_vehicle(place)
+        if known and self._every[dialect.CAMERA_TRACKING_GEO_STATUS].due(now_s):
+            here = self.poses.at(round(now_s * 1e9))
+            from_deg = None
+            if here.latitude_deg is not None and here.longitude_deg is not None:
+                from_deg = (here.latitude_deg, here.longitude_deg)
+            surest = min(known, key=lambda place: place.sigma_m)
+            yield "CAMERA_TRACKING_GEO_STATUS", camera_target(surest, from_deg)
 
     def _records(self, now_s: float, status: Status) -> Iterator[Any]:
         """LOCAGEN_BEARING and LOCAGEN_POSITION of all callers, or that nothing is heard."""
-        time_us = status.t_ns // 1000 - round(self._start_s * 1e6)
+        every = self._every[dialect.LOCAGEN_BEARING]
         if status.track is None:
-            if self._nothing.due(now_s):
-                yield bearing_message(_bearing_record(time_us, status, None))
+            if math.isfinite(every.period_s) and self._nothing.due(now_s):
+                yield bearing_message(_bearing_record(self._time_of(status), status, None))
             return
-        if not self._bearings.due(now_s):
+        if not every.due(now_s):
             return
+        time = self._time_of(status)
         for track in (status.track, *status.others):
             if track is not status.track and not is_confirmed(track):
                 continue
-            yield bearing_message(_bearing_record(time_us, status, track))
+            yield bearing_message(_bearing_record(time, status, track))
             place = status.place(track)
             if place is not None and is_confirmed(track):
-                yield position_message(_position_record(time_us, status, place, track.id in self._placed))
+                yield position_message(_position_record(time, status, place, track.id in self._placed))
+
+    def _time_of(self, status: Status) -> Moment:
+        """Of the sound: on the autopilot's clock where that is known, else since our start."""
+        time_us, on_autopilot = self.clock.time_us(status.t_ns)
+        return time_us if on_autopilot else time_us - round(self._start_s * 1e6), on_autopilot
+
+    def _answer(self, link: int, *messages: Any) -> None:
+        for message in messages:
+            self._answers[link].append(self._pack(message.get_type(), message))
 
     def _pack(self, name: str, message: Any) -> bytes:
         self.sent[name] += 1
+        if message.get_msgId() in _REMEMBERED:
+            self._last[message.get_msgId()] = message
         return self._sender.pack(message)
 
     def _follow_call(self, status: Status) -> None:
@@ -348,10 +589,10 @@ def _how_far(status: Status, track: Track) -> str:
     return f"{math.hypot(away[0], away[1]):.0f} m +-{max(1, round(place.semi_major_m))} m"
 
 
-def _bearing_record(time_us: int, status: Status, track: Track | None) -> BearingRecord:
+def _bearing_record(time: Moment, status: Status, track: Track | None) -> BearingRecord:
     heard = BearingRecord(
-        time_us=time_us,
-        autopilot_time=False,
+        time_us=time[0],
+        autopilot_time=time[1],
         event_id=0,
         snr_db=status.snr_db,
         noise_dbfs=status.noise_dbfs,
@@ -374,15 +615,15 @@ def _bearing_record(time_us: int, status: Status, track: Track | None) -> Bearin
     )
 
 
-def _position_record(time_us: int, status: Status, place: Position, told: bool) -> PositionRecord:
+def _position_record(time: Moment, status: Status, place: Position, told: bool) -> PositionRecord:
     assert place.latitude_deg is not None
     assert place.longitude_deg is not None
     (nn, ne), (_, ee) = place.covariance_m2.tolist()
     # the ground at the caller is told where a depression over a height was: without one, bearings crossed
     on_ground = place.altitude_m is not None
     return PositionRecord(
-        time_us=time_us,
-        autopilot_time=False,
+        time_us=time[0],
+        autopilot_time=time[1],
         event_id=place.caller,
         latitude_deg=place.latitude_deg,
         longitude_deg=place.longitude_deg,
@@ -417,23 +658,33 @@ def _is_autopilot(packet: Packet) -> bool:
     return bool(message.type != dialect.TYPE_GROUND_STATION and message.autopilot != dialect.AUTOPILOT_NONE)
 
 
-WAYS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "message": ("", lambda message: message),
-    "tunnel": ("TUNNEL", dialect.tunnel),
+def _periods(settings: MavlinkSettings) -> dict[int, float]:
+    """What repeats, and how often in seconds, as the settings say."""
+    return {
+        dialect.HEARTBEAT: HEARTBEAT_S,
+        dialect.NAMED_VALUE_FLOAT: 1.0 / settings.rate_hz,
+        dialect.LOCAGEN_BEARING: 1.0 / settings.rate_hz,  # LOCAGEN_POSITION goes with it
+        dialect.ADSB_VEHICLE: PLACES_S,
+        dialect.CAMERA_TRACKING_GEO_STATUS: PLACES_S,
+        dialect.ONBOARD_COMPUTER_STATUS: COMPUTER_S,
+    }
+
+
+def _allowed(settings: MavlinkSettings) -> frozenset[int]:
+    """The messages that the switches let out."""
+    on = (ids for name, ids in dialect.SWITCHED.items() if getattr(settings, name))
+    return dialect.ALWAYS_SENT.union(*on)
+
+
+_REMEMBERED = frozenset({dialect.LOCAGEN_BEARING, dialect.LOCAGEN_POSITION, dialect.ONBOARD_COMPUTER_STATUS})
+_REQUESTS: dict[int, Callable[[Component, Packet, Any, int, float], None]] = {
+    dialect.PING: Component._hear_ping,
+    dialect.TIMESYNC: Component._hear_timesync,
+    dialect.PARAM_REQUEST_LIST: Component._hear_list,
+    dialect.PARAM_REQUEST_READ: Component._hear_read,
+    dialect.PARAM_SET: Component._hear_set,
+    dialect.FILE_TRANSFER_PROTOCOL: Component._hear_file,
+    dialect.COMMAND_LONG: Component._hear_command,
+    dialect.COMMAND_INT: Component._hear_command,
 }
-"""what `mavlink.records` may name: the message's name where it is another, and how it is made"""
-
-
-class _Every:
-    """Says when a period has passed, without drift; after a pause it begins anew at once."""
-
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
-        self._next_s = -math.inf
-
-    def due(self, now_s: float) -> bool:
-        if now_s < self._next_s:
-            return False
-        on_time = now_s - self._next_s < self._period_s
-        self._next_s = (self._next_s if on_time else now_s) + self._period_s
-        return True
+"""what is asked of us, and where it goes"""

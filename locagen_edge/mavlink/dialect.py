@@ -37,27 +37,61 @@ PING: int = messages.MAVLINK_MSG_ID_PING
 LOCAGEN_BEARING: int = messages.MAVLINK_MSG_ID_LOCAGEN_BEARING
 LOCAGEN_POSITION: int = messages.MAVLINK_MSG_ID_LOCAGEN_POSITION
 
-SENT = frozenset(
+TIMESYNC: int = messages.MAVLINK_MSG_ID_TIMESYNC
+PARAM_REQUEST_LIST: int = messages.MAVLINK_MSG_ID_PARAM_REQUEST_LIST
+PARAM_REQUEST_READ: int = messages.MAVLINK_MSG_ID_PARAM_REQUEST_READ
+PARAM_SET: int = messages.MAVLINK_MSG_ID_PARAM_SET
+PARAM_VALUE: int = messages.MAVLINK_MSG_ID_PARAM_VALUE
+FILE_TRANSFER_PROTOCOL: int = messages.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL
+COMMAND_INT: int = messages.MAVLINK_MSG_ID_COMMAND_INT
+MESSAGE_INTERVAL: int = messages.MAVLINK_MSG_ID_MESSAGE_INTERVAL
+AUTOPILOT_VERSION: int = messages.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+ONBOARD_COMPUTER_STATUS: int = messages.MAVLINK_MSG_ID_ONBOARD_COMPUTER_STATUS
+ADSB_VEHICLE: int = messages.MAVLINK_MSG_ID_ADSB_VEHICLE
+CAMERA_TRACKING_GEO_STATUS: int = messages.MAVLINK_MSG_ID_CAMERA_TRACKING_GEO_STATUS
+
+ALWAYS_SENT = frozenset(
     {
         HEARTBEAT,
         NAMED_VALUE_FLOAT,
         STATUSTEXT,
-        TUNNEL,
         PING,
+        TIMESYNC,
+        PARAM_VALUE,
+        FILE_TRANSFER_PROTOCOL,
         COMMAND_LONG,
-        LOCAGEN_BEARING,
-        LOCAGEN_POSITION,
+        COMMAND_ACK,
+        MESSAGE_INTERVAL,
+        AUTOPILOT_VERSION,
     }
 )
-"""ids that may leave"""
-COMMANDS = frozenset({messages.MAV_CMD_SET_MESSAGE_INTERVAL})
+SWITCHED = {
+    "send_records": frozenset({LOCAGEN_BEARING, LOCAGEN_POSITION}),
+    "send_tunnel": frozenset({TUNNEL}),
+    "send_adsb": frozenset({ADSB_VEHICLE}),
+    "send_camera_target": frozenset({CAMERA_TRACKING_GEO_STATUS}),
+    "send_computer_status": frozenset({ONBOARD_COMPUTER_STATUS}),
+}
+"""what each switch in the settings, section `mavlink`, lets out"""
+SENT = ALWAYS_SENT.union({COMMAND_INT}, *SWITCHED.values())
+"""ids that may leave; COMMAND_INT carries nothing but what the section `flight` switches on"""
+
+SET_MESSAGE_INTERVAL: int = messages.MAV_CMD_SET_MESSAGE_INTERVAL
+SET_ROI_LOCATION: int = messages.MAV_CMD_DO_SET_ROI_LOCATION
+CONDITION_YAW: int = messages.MAV_CMD_CONDITION_YAW
+
+COMMANDS = frozenset({SET_MESSAGE_INTERVAL})
 """and the commands: an autopilot obeys mode, arming and position from an onboard computer too"""
+FLIGHT_COMMANDS = {"roi": SET_ROI_LOCATION, "yaw": CONDITION_YAW}
+"""what each switch in the settings file, section `flight`, lets out beside them"""
 
 STATE_ACTIVE: int = messages.MAV_STATE_ACTIVE
+STATE_STANDBY: int = messages.MAV_STATE_STANDBY
 STATE_CRITICAL: int = messages.MAV_STATE_CRITICAL
 
 SEVERITY_WARNING: int = messages.MAV_SEVERITY_WARNING
 SEVERITY_NOTICE: int = messages.MAV_SEVERITY_NOTICE
+SEVERITY_INFO: int = messages.MAV_SEVERITY_INFO
 
 COMPONENT_AUTOPILOT: int = messages.MAV_COMP_ID_AUTOPILOT1
 TYPE_GROUND_STATION: int = messages.MAV_TYPE_GCS
@@ -65,6 +99,8 @@ AUTOPILOT_NONE: int = messages.MAV_AUTOPILOT_INVALID
 
 TEXT_BYTES = 50
 """STATUSTEXT without chunks"""
+TEXT_CHUNKS = 4
+"""most chunks of one text"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,10 +209,22 @@ def named_value_float(time_boot_ms: int, name: str, value: float) -> Any:
     return messages.MAVLink_named_value_float_message(time_boot_ms & 0xFFFFFFFF, name.encode("ascii"), value)
 
 
-def statustext(severity: int, text: str) -> Any:
-    """STATUSTEXT in printable ASCII, cut at 50 bytes: what else the text holds becomes a question mark."""
-    plain = "".join(c if " " <= c <= "~" else "?" for c in text[:TEXT_BYTES])
-    return messages.MAVLink_statustext_message(severity, plain.encode("ascii"))
+def statustexts(severity: int, text: str, number: int = 1) -> list[Any]:
+    """STATUSTEXT in printable ASCII; what else the text holds becomes a question mark.
+
+    Beyond 50 bytes it goes in chunks under a common number from 1 to 65535, at most four: the rest is cut.
+    The last chunk is the one that is not full, so a text of 100 bytes has an empty third.
+    """
+    plain = "".join(c if " " <= c <= "~" else "?" for c in text)
+    if len(plain) <= TEXT_BYTES:
+        return [messages.MAVLink_statustext_message(severity, plain.encode("ascii"))]
+    plain = plain[: TEXT_CHUNKS * TEXT_BYTES - 1]
+    return [
+        messages.MAVLink_statustext_message(
+            severity, plain[start : start + TEXT_BYTES].encode("ascii"), number, start // TEXT_BYTES
+        )
+        for start in range(0, len(plain) + 1, TEXT_BYTES)
+    ]
 
 
 def ping(asked: Any, system_id: int, component_id: int) -> Any:
@@ -215,28 +263,40 @@ def untunnel(message: Any) -> Any | None:
     return decode(frame + checksum(frame[1:], kind.crc_extra).to_bytes(2, "little"))
 
 
-def set_message_interval(system_id: int, message_id: int, interval_us: int) -> Any:
-    """The command to an autopilot to send us a message this often: the only command that we give."""
-    return messages.MAVLink_command_long_message(
-        target_system=system_id,
-        target_component=COMPONENT_AUTOPILOT,
-        command=messages.MAV_CMD_SET_MESSAGE_INTERVAL,
-        confirmation=0,
-        param1=float(message_id),
-        param2=float(interval_us),
-        param3=0.0,
-        param4=0.0,
-        param5=0.0,
-        param6=0.0,
-        param7=0.0,  # to whom: as the autopilot does by itself, on the link on which it was asked
+def command(system_id: int, command: int, *parameters: float) -> Any:
+    """COMMAND_LONG to the autopilot; parameters that are not given are 0."""
+    given = [float(value) for value in parameters] + [0.0] * (7 - len(parameters))
+    return messages.MAVLink_command_long_message(system_id, COMPONENT_AUTOPILOT, command, 0, *given)
+
+
+def command_at(
+    system_id: int, command: int, latitude_deg: float, longitude_deg: float, altitude_m: float | None
+) -> Any:
+    """COMMAND_INT to the autopilot with a place; altitude above sea level, None: that of the take-off place.
+
+    In COMMAND_LONG a longitude would be a float32, good for some metres.
+    """
+    if altitude_m is None or not abs(altitude_m) < 1e5:  # NaN too
+        altitude_m, frame = 0.0, messages.MAV_FRAME_GLOBAL_RELATIVE_ALT
+    else:
+        frame = messages.MAV_FRAME_GLOBAL
+    lat, lon = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
+    return messages.MAVLink_command_int_message(
+        system_id, COMPONENT_AUTOPILOT, frame, command, 0, 0, 0.0, 0.0, 0.0, 0.0, lat, lon, altitude_m
     )
 
 
-class Sender:
-    """Packs messages as MAVLink 2 under our ids, and numbers them."""
+def set_message_interval(system_id: int, message_id: int, interval_us: int) -> Any:
+    """The command to an autopilot to send us a message this often, on the link on which it was asked."""
+    return command(system_id, SET_MESSAGE_INTERVAL, message_id, interval_us)
 
-    def __init__(self, system_id: int, component_id: int) -> None:
+
+class Sender:
+    """Packs messages as MAVLink 2 under our ids, and numbers them. `commands`: those that may leave."""
+
+    def __init__(self, system_id: int, component_id: int, commands: frozenset[int] = COMMANDS) -> None:
         self._mav = messages.MAVLink(None, system_id, component_id)
+        self._commands = commands
 
     @property
     def component_id(self) -> int:
@@ -253,11 +313,11 @@ class Sender:
     def pack(self, message: Any) -> bytes:
         """The frame; the next one gets the next sequence number.
 
-        Raises `ValueError` for what is not in `SENT`, or a command not in `COMMANDS`.
+        Raises `ValueError` for what is not in `SENT`, or a command that may not leave.
         """
         if message.get_msgId() not in SENT:
             raise ValueError(f"{message.get_type()} is none of the messages that may leave")
-        if message.get_msgId() == COMMAND_LONG and message.command not in COMMANDS:
+        if message.get_msgId() in (COMMAND_LONG, COMMAND_INT) and message.command not in self._commands:
             raise ValueError(f"command {message.command} is none of those that may leave")
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256

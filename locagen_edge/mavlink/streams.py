@@ -27,7 +27,7 @@ class Streams:
     """Decides what to ask for next. `rate_hz`: of attitudes; 0: nothing is ever asked for."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._rate_hz = rate_hz
+        self.rate_hz = rate_hz
         self._queue: deque[int] = deque()
         self._arrived_s: dict[int, float] = {}
         self._asked_s = -math.inf
@@ -48,7 +48,7 @@ class Streams:
 
     def due(self, now_s: float) -> tuple[int, int] | None:
         """The message to ask for now and its interval in microseconds; None: nothing, or nobody to ask."""
-        if self._rate_hz <= 0.0 or now_s - self._beat_s > GAP_S or now_s - self._asked_s < PACE_S:
+        if self.rate_hz <= 0.0 or now_s - self._beat_s > GAP_S or now_s - self._asked_s < PACE_S:
             return None
         if not self._queue and now_s - self._asked_s > AGAIN_S:
             self._queue.extend(id for id in _NEVER_MISSING if self._silent_s(id, now_s) > AGAIN_S)
@@ -56,7 +56,7 @@ class Streams:
             return None
         self._asked_s = now_s
         id = self._queue.popleft()
-        return id, round(1e6 / (self._rate_hz * WANTED[id]))
+        return id, round(1e6 / (self.rate_hz * WANTED[id]))
 
     def _silent_s(self, id: int, now_s: float) -> float:
         return now_s - self._arrived_s.get(id, -math.inf)

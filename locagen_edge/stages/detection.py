@@ -67,6 +67,15 @@ class Detector:
         self._since_s = since_s if call else 0.0
         return Detection(call, snr_db, 10.0 * math.log10(level), self._since_s)
 
+    def apply(self, settings: DetectionSettings) -> None:
+        """New limits from the next frame on; the background stays."""
+        self._settings = settings
+
+    def forget(self) -> None:
+        """The next frame is all that is known of the background."""
+        self._smooth = None
+        self._minima.clear()
+
     def _follow(self, level: float, elapsed_s: float) -> float:
         """The background's power with this frame in it."""
         if self._smooth is None:

@@ -103,6 +103,10 @@ class FaultFinder:
         self._share: dict[str, float] = {}
         self._raised: set[str] = set()
 
+    def apply(self, settings: Settings) -> None:
+        """Another array or speed of sound from the next frame on; faults that last go on."""
+        self._fit = DelayFit(settings)
+
     def __call__(
         self, frame: Frame, correlation: Correlation, tdoa: Tdoa, elapsed_s: float
     ) -> tuple[str, ...]:

@@ -389,7 +389,10 @@ def test_texts_keep_their_distance_and_the_overflow_is_counted() -> None:
     component = Component(MavlinkSettings())
     flood = replace(QUIET, faults=tuple(f"fault {k}" for k in range(20)))
     told = [(t, m.text) for t, m in speak(component, flood, 10) if m.get_type() == "STATUSTEXT"]
-    assert [text for _, text in told] == [f"fault {k}" for k in range(voice.TEXTS_WAITING)]
+    assert [text for _, text in told] == [
+        *(f"fault {k}" for k in range(voice.TEXTS_WAITING)),
+        f"{20 - voice.TEXTS_WAITING} texts were left out: too many at once",
+    ]
     assert component.texts_dropped == 20 - voice.TEXTS_WAITING
     assert told[-1][0] >= (len(told) - 1) * voice.TEXT_S
 
@@ -400,7 +403,8 @@ def test_a_call_goes_before_faults_even_when_the_queue_is_full() -> None:
     component.due(0.0, replace(QUIET, faults=flood))
     told = texts(said(component, replace(CALLING, faults=(*flood, "one more")), 9, 0.1))
     assert told[0].startswith("Call heard")
-    assert told[1:] == [f"fault {k}" for k in range(1, voice.TEXTS_WAITING)], "the newest made room"
+    assert told[1:-1] == [f"fault {k}" for k in range(1, voice.TEXTS_WAITING)], "the newest made room"
+    assert told[-1] == f"{component.texts_dropped} texts were left out: too many at once"
     assert component.texts_dropped == 20 - voice.TEXTS_WAITING + 1
 
 
@@ -413,12 +417,20 @@ def test_when_the_link_comes_up_what_holds_is_told_again() -> None:
     assert len(first) == 2
 
 
-@given(st.text(max_size=120))
+@given(st.text(max_size=120) | st.text(min_size=95, max_size=260))
 def test_any_text_fits_and_stays_readable(words: str) -> None:
     frames = Component(MavlinkSettings()).due(0.0, replace(QUIET, faults=(words,)))
-    (text,) = texts(decode(frames))
-    assert len(text) == min(50, len(words))
+    chunks = [m for m in decode(frames) if m.get_type() == "STATUSTEXT"]
+    text = "".join(chunk.text for chunk in chunks)
+    assert len(text) == min(199, len(words))
     assert all(" " <= c <= "~" for c in text)
+    assert [chunk.chunk_seq for chunk in chunks] == list(range(len(chunks)))
+    assert len({chunk.id for chunk in chunks}) == 1
+    assert (chunks[0].id > 0) == (len(chunks) > 1) == (len(words) > 50), (
+        "a number only where there are chunks"
+    )
+    assert all(len(chunk.text) == 50 for chunk in chunks[:-1])
+    assert len(chunks) == 1 or len(chunks[-1].text) < 50, "what is not full ends it"
     assert all(a == b or b == "?" for a, b in zip(words, text, strict=False))
 
 
@@ -450,7 +462,7 @@ def test_only_these_messages_ever_leave(statuses: list[Status], noise: bytes) ->
         messages = decode(component.due(k * 0.4, status))
         ids.update(m.get_msgId() for m in messages)
         assert all(m.command == 511 for m in messages if m.get_msgId() == 76)  # SET_MESSAGE_INTERVAL
-    assert set(ids) <= {0, 76, 251, 253, 385, 59500, 59501}
+    assert set(ids) <= {0, 76, 111, 251, 253, 385, 59500, 59501}
     assert sum(ids.values()) == sum(component.sent.values())
 
 
@@ -474,7 +486,7 @@ def test_no_place_is_told_where_the_range_is_not_observable() -> None:
 
 
 def test_the_records_say_what_is_known() -> None:
-    messages = said(Component(MavlinkSettings(records=("message",)), start_s=0.5), PLACED, 5)
+    messages = said(Component(MavlinkSettings(send_tunnel=False), start_s=0.5), PLACED, 5)
     bearing = next(m for m in messages if m.get_type() == "LOCAGEN_BEARING")
     assert bearing.time_usec == 1_500_000
     assert (bearing.lat, bearing.lon, bearing.alt, bearing.height) == (470_000_000, 80_000_000, 420_000, 20)
@@ -503,7 +515,9 @@ def test_every_confirmed_caller_has_a_record_and_values_are_of_the_best() -> Non
 
 @pytest.mark.parametrize("ways", [(), ("message",), ("tunnel",), ("message", "tunnel")])
 def test_the_settings_choose_how_records_go(ways: tuple[str, ...]) -> None:
-    messages = said(Component(MavlinkSettings(records=ways)), PLACED, 5)
+    messages = said(
+        Component(MavlinkSettings(send_records="message" in ways, send_tunnel="tunnel" in ways)), PLACED, 5
+    )
     kinds = {m.get_type() for m in messages}
     assert ({"LOCAGEN_BEARING", "LOCAGEN_POSITION"} <= kinds) == ("message" in ways)
     assert ("TUNNEL" in kinds) == ("tunnel" in ways)
@@ -513,7 +527,7 @@ def test_the_settings_choose_how_records_go(ways: tuple[str, ...]) -> None:
 
 
 def test_that_nothing_is_heard_is_told_once_a_second_and_by_the_deaf_never() -> None:
-    component = Component(MavlinkSettings(records=("message",)))
+    component = Component(MavlinkSettings(send_tunnel=False))
     quiet = [m for m in said(component, QUIET, 10) if m.get_type() == "LOCAGEN_BEARING"]
     assert len(quiet) == 10
     assert all(m.flags & dialect.messages.LOCAGEN_BEARING_FLAGS_NOTHING_HEARD for m in quiet)

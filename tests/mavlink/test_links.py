@@ -39,7 +39,7 @@ class Node:
     """A component on its links, as the daemon holds them."""
 
     def __init__(self, specs: list[str], guard: Guard | None = None) -> None:
-        self.component = Component(MavlinkSettings(records=()), guard=guard)
+        self.component = Component(MavlinkSettings(send_records=False, send_tunnel=False), guard=guard)
         self.links = Links([parse(s) for s in specs], backoff_s=10.0, on_bytes=self.receive, guard=guard)
 
     def receive(self, number: int, data: bytes) -> None:

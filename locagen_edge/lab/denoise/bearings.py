@@ -133,7 +133,8 @@ def _rotors(s: LabSettings, event: Event, rng: np.random.Generator) -> F64:
         place(piece, s.audio.rate_hz, s.mic_array.positions_m, hub, s.speed_m_s)
         for piece, hub in zip(_pieces(event, len(hubs), rng), hubs, strict=True)
     ]
-    return np.sum(heard, axis=0)
+    sound: F64 = np.sum(heard, axis=0)
+    return sound
 
 
 def _simulated(s: LabSettings, event: Event, rng: np.random.Generator) -> F64:
@@ -222,12 +223,12 @@ def answers(
 
 def evaluate(
     s: LabSettings, count: int, processes: int = 1, methods: tuple[str, ...] = tuple(METHODS),
-    fields: tuple[str, ...] = tuple(FIELDS), snrs_db: tuple[float, ...] = SNRS_DB,
+    fields: tuple[str, ...] = tuple(FIELDS), snrs_db: tuple[float, ...] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Counts of `count` events in each of `fields`."""
     chosen = list(events(s, count))
     jobs = [(event, field) for event in chosen for field in fields]
-    ask = partial(answers, s, methods, snrs_db)
+    ask = partial(answers, s, methods, SNRS_DB if snrs_db is None else snrs_db)
     bar = partial(tqdm, total=len(jobs), unit="scene", desc="bearings")
     if processes > 1:
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
@@ -253,10 +254,10 @@ def summary(chosen: list[Event], said: list[Answer]) -> dict[str, Any]:
     }
 
 
-def _cell(answers: list[Answer]) -> dict[str, float]:
-    right, of = sum(x.right for x in answers), len(answers)
+def _cell(said: list[Answer]) -> dict[str, float]:
+    right, of = sum(x.right for x in said), len(said)
     low, high = wilson(right, of)
-    return {"right": right / of, "low": low, "high": high, "called": sum(x.called for x in answers) / of}
+    return {"right": right / of, "low": low, "high": high, "called": sum(x.called for x in said) / of}
 
 
 def wilson(right: int, of: int) -> tuple[float, float]:

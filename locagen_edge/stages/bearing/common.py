@@ -30,6 +30,12 @@ class Locator(Protocol):
     def settle(self, call: bool, /) -> None:
         """Told afterwards whether the frame was taken for a call."""
 
+    def apply(self, settings: Settings, /) -> None:
+        """New limits and rates for the same array; what was learnt stays."""
+
+    def forget(self) -> None:
+        """Forgets what was learnt of the noise."""
+
 
 class OnDelays:
     """A locator that needs the delays only, and remembers nothing."""
@@ -42,6 +48,12 @@ class OnDelays:
 
     def settle(self, _: bool, /) -> None:
         """Nothing is learnt."""
+
+    def apply(self, _: Settings, /) -> None:
+        """An estimator on delays has no limits of its own."""
+
+    def forget(self) -> None:
+        """Nothing was learnt."""
 
 
 NOWHERE_RAD = math.pi / math.sqrt(3.0)

@@ -36,8 +36,6 @@ LAG_S = 0.5
 """Noise is learnt so late: by then a call is known as one, and its beginning is not learnt."""
 MEANING = 1.6
 """Evidence from which a direction means something, though not yet a call."""
-GROWTH_S = 2.0
-"""Noise that is taken for calls ceases to be: what is kept in mind of it grows by e in this time at most."""
 WATCH_S = 15.0
 LOUDER = -0.5
 """Contrast over score below which all of the noise has become louder: about -2 where it has, 0 for a call."""
@@ -47,6 +45,9 @@ FLAT = 0.8
 """Least score over the best from which all directions are alike: noise far louder than what was learnt."""
 SILENCE = 1e-11
 """-110 dBFS mean square in the band: a muted input teaches nothing."""
+RIVAL = 0.9
+"""Score of another lobe over the best from which nobody knows which is true: 0.96 and more for a whistle of
+3 kHz, whose wavelength is shorter than twice the array; under 0.7 for voices."""
 SECOND = 0.2
 """Least score of a second caller beside the first one's, who has to be a call by himself too: below it lies
 what a null leaves of the first."""
@@ -81,22 +82,24 @@ class SteeredLocator:
         first = self._search.first_bin
         self._band = slice(first, first + len(self._search.frequency_hz))
         self._weights: F32 = np.ones((len(self._spans_s), len(self._search.frequency_hz)), dtype=np.float32)
-        self._least_ratio = settings.detection.evidence
-        self._forget_s = steered.forget_s
-        self._patience = steered.forget_s / hop_s
         self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
         self._mics = settings.mic_array.mics
-        self._begin_anew()
-        self._onsets = Onsets(hop_s)
-        self._scores = [0.0 for _ in self._spans_s]
-        self._strange = [False for _ in self._spans_s]
-        self._strange_hops = 0
-        self._loud_hops_ago: int | None = None
         self._elapsed_s = 0.0
         self._mask: Mask | None = None
         # A microphone that fails for a moment must not be missing from the matrix for long after; one that
         # has failed for good must not keep the others from learning.
         self._bad_hops = 0
+        self.apply(settings)
+        self._know_nothing()
+
+    def _know_nothing(self) -> None:
+        """Neither noise nor what has just been heard."""
+        self._begin_anew()
+        self._onsets = Onsets(self._hop_s)
+        self._scores = [0.0 for _ in self._spans_s]
+        self._strange = [False for _ in self._spans_s]
+        self._strange_hops = 0
+        self._loud_hops_ago: int | None = None
         self._failing: deque[bool] = deque(maxlen=self._lag + 1)
         self._silent: deque[bool] = deque(maxlen=self._lag + 1)
         self._quiet_hops = 0
@@ -107,6 +110,18 @@ class SteeredLocator:
         self._learnt_frames = 0
         self._to_learn = LOOKS * self._mics
         self._usual = tuple(Usual() for _ in self._spans_s)
+
+    def apply(self, settings: Settings, /) -> None:
+        """Limit and memories as these settings say; what was learnt of the noise stays."""
+        self._least_ratio = settings.detection.evidence
+        self._spans_s = (0.0, settings.steered.span_s)
+        self._forget_s = settings.steered.forget_s
+        self._patience = settings.steered.forget_s / self._hop_s
+
+    def forget(self) -> None:
+        """Begins anew with the noise's matrix."""
+        self._search.reset()
+        self._know_nothing()
 
     def __call__(
         self, frame: Frame, _: Tdoa, elapsed_s: float, mask: Mask | None = None, /
@@ -133,7 +148,8 @@ class SteeredLocator:
         if ratios[0] >= self._least_ratio:
             order = [0, *order]
         for span in order:
-            if not found[span]:
+            # between a loud caller's sounds an average only tells where he was
+            if not found[span] or (span > 0 and self._loud_hops_ago):
                 continue
             towards = self._nearest(found[span][0])
             # an average over a second remembers what has ended
@@ -194,13 +210,16 @@ class SteeredLocator:
         self._search.weigh(self._weights[span])
         placed = self._sources(span)
         self._search.weigh(np.ones_like(self._weights[span]))
-        return list(placed[: len(found)]) if len(placed) >= len(found) else found
+        too_little = len(placed) < len(found) or placed[0].rival > RIVAL
+        return found if too_little else list(placed[: len(found)])
 
     def _nearest(self, source: Source) -> int:
         """On the grid."""
         return int(np.argmax(self._grid_u @ direction(source.azimuth_rad, source.elevation_rad)))
 
     def _told(self, source: Source, span: int, evidence: Evidence) -> Bearing:
+        if source.rival > RIVAL:
+            return no_bearing(NAME, evidence)
         azimuth_sigma, elevation_sigma = source.sigma_rad()
         # positions that are off turn a source below by as much over cos(elevation)
         tolerance = self._tolerance / max(math.cos(source.elevation_rad), 0.1)
@@ -239,17 +258,16 @@ class SteeredLocator:
 
     def _watch(self, call: bool) -> None:
         """What the noise's scores are, put aside until it is sure that they are the noise's."""
-        share = 1.0 - math.exp(-self._hop_s / WATCH_S)
         self._since_lag.append(max(self._ratios()))
         self._quiet_hops = 0 if call else self._quiet_hops + 1
+        quiet = self._quiet_hops * self._hop_s > PAUSE_S  # a call fades out, and its pauses are no noise
         for span in range(len(self._spans_s)):
-            if call:
-                self._search.doubt(share, self._hop_s / GROWTH_S, span)
-                continue
-            if not self._strange[span]:
+            if not quiet:
+                self._search.doubt(span)
+            elif not self._strange[span]:
                 self._search.watch(span)
-            if self._quiet_hops % self._lag == 0:
-                self._search.settle(share, span)
+            if quiet and self._quiet_hops % self._lag == 0:
+                self._search.settle(1.0 - math.exp(-self._hop_s / WATCH_S), span)
         for usual, score in zip(self._usual, self._scores, strict=True):
             usual.learn(score, self._elapsed_s)
         if not self._usual[0].young and max(self._since_lag) < self._least_ratio:

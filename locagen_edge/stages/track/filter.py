@@ -38,6 +38,10 @@ LEAST_SHARE = 0.1
 """Of a bearing's sigma that counts as noise, however much of it is explained by fixed errors."""
 
 
+_EYE: F64 = np.eye(3)
+_LEVEL: F64 = np.diag([1.0, 1.0, 0.0])
+
+
 @dataclass(frozen=True, slots=True)
 class Motion:
     """How directions move in one kind of axes."""
@@ -144,11 +148,11 @@ def predicted(state: State, motion: Motion, dt: float) -> State:
     f = np.zeros((6, 6))
     f[:3, :3] = turn
     f[:3, 3:] = lever * dt
-    f[3:, 3:] = turn if motion.great_circle else np.eye(3)
+    f[3:, 3:] = turn if motion.great_circle else _EYE
     axes = motion.axes(u)
     q = np.zeros((6, 6))
     q[:3, :3] = lever @ axes @ lever.T * (motion.agility_rad**2 * dt**3 / 3)
-    q[:3, :3] += lever @ np.diag([1.0, 1.0, 0.0]) @ lever.T * (motion.wobble_rad**2 * dt)
+    q[:3, :3] += lever @ _LEVEL @ lever.T * (motion.wobble_rad**2 * dt)
     q[:3, 3:] = lever @ axes * (motion.agility_rad**2 * dt**2 / 2)
     q[3:, :3] = q[:3, 3:].T
     q[3:, 3:] = axes * (motion.agility_rad**2 * dt)

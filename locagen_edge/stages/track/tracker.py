@@ -89,15 +89,19 @@ class Tracker:
         overlap: float,
         normal: F64 | None = None,
     ):
-        self._compass, self._tilt = math.radians(pose.compass_deg), math.radians(pose.tilt_deg)
-        self._normal = normal
-        self._settings = settings
         self._fixed = tolerance_rad**2
         self._inflation = max(0.75 * overlap, 1.0)  # 1.5 at half overlap: Hann frames correlate by 1/6
-        self._motions = {False: sphere.body_motion(settings), True: sphere.earth_motion(settings)}
+        self.apply(settings, pose, normal)
         self._turn: F64 | None = None  # body -> earth, of the last frame
         self._callers: list[_Caller] = []  # the best first
         self._ids = itertools.count(1)
+
+    def apply(self, settings: TrackSettings, pose: PoseSettings, normal: F64 | None = None) -> None:
+        """As these settings say from the next frame on; callers keep their tracks and numbers."""
+        self._compass, self._tilt = math.radians(pose.compass_deg), math.radians(pose.tilt_deg)
+        self._normal = normal
+        self._settings = settings
+        self._motions = {False: sphere.body_motion(settings), True: sphere.earth_motion(settings)}
 
     def __call__(
         self,
@@ -135,6 +139,7 @@ class Tracker:
             caller.look = None
             caller.confidence *= math.exp(-dt / CONFIDENCE_S)
         self._callers = [c for c in self._callers if c.silent_s <= self._settings.coast_s]
+        del self._callers[self._settings.most :]
         self._turn = turn
         if turn is None:
             return 0.0
