@@ -21,7 +21,7 @@ from locagen_edge.kernel import Source, Steered
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import LARGEST_AZIMUTH_SIGMA_RAD, NOWHERE_RAD, no_bearing
 from locagen_edge.stages.bearing.evidence import Onsets, Usual
-from locagen_edge.types import F32, Bearing, Evidence, Frame, Mask, Tdoa
+from locagen_edge.types import F32, F64, Bearing, Evidence, Frame, Mask, Tdoa
 
 NAME = "steered"
 
@@ -82,6 +82,9 @@ class SteeredLocator:
         first = self._search.first_bin
         self._band = slice(first, first + len(self._search.frequency_hz))
         self._weights: F32 = np.ones((len(self._spans_s), len(self._search.frequency_hz)), dtype=np.float32)
+        places_m = settings.mic_array.positions_m - settings.mic_array.positions_m.mean(axis=0)
+        self._spread_m2: F64 = places_m.T @ places_m
+        self._tolerance_m = settings.array.tolerance_m
         self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
         self._mics = settings.mic_array.mics
         self._elapsed_s = 0.0
@@ -221,10 +224,9 @@ class SteeredLocator:
         if source.rival > RIVAL:
             return no_bearing(NAME, evidence)
         azimuth_sigma, elevation_sigma = source.sigma_rad()
-        # positions that are off turn a source below by as much over cos(elevation)
-        tolerance = self._tolerance / max(math.cos(source.elevation_rad), 0.1)
-        azimuth_sigma = math.hypot(azimuth_sigma, tolerance)
-        elevation_sigma = math.hypot(elevation_sigma, tolerance)
+        of_azimuth, of_elevation = self._of_positions(source)
+        azimuth_sigma = math.hypot(azimuth_sigma, of_azimuth)
+        elevation_sigma = math.hypot(elevation_sigma, of_elevation)
         return Bearing(
             azimuth_rad=source.azimuth_rad if azimuth_sigma < LARGEST_AZIMUTH_SIGMA_RAD else None,
             azimuth_sigma_rad=min(azimuth_sigma, NOWHERE_RAD),
@@ -235,6 +237,23 @@ class SteeredLocator:
             evidence=evidence,
             span_s=self._spans_s[span],
         )
+
+    def _of_positions(self, source: Source) -> tuple[float, float]:
+        """1-sigma of azimuth and elevation from positions that are off, radians: least squares over the
+        microphones' ways, as in `tolerance_rad`. A flat array sees the elevation through its cosine, which
+        hardly changes near the horizon."""
+        c, s = math.cos(source.azimuth_rad), math.sin(source.azimuth_rad)
+        level, below = max(math.cos(source.elevation_rad), 0.1), math.sin(source.elevation_rad)
+        arcs = np.array([[-s, c, 0.0], [-below * c, -below * s, -math.cos(source.elevation_rad)]])
+        seen = arcs @ self._spread_m2 @ arcs.T
+        # on the very horizon the second order is left: 1 - cos(error) is what the positions are off by
+        seen[1, 1] += 0.5 * self._tolerance * seen[0, 0]
+        scale = self._tolerance_m / math.sqrt(max(float(np.linalg.det(seen)), 1e-18))
+        return scale * math.sqrt(seen[1, 1]) / level, scale * math.sqrt(seen[0, 0])
+
+    def scores(self, bearing: Bearing) -> tuple[F32, F32]:
+        """What a bearing of this frame was taken from: azimuths (columns,) and scores (rows, columns)."""
+        return self._search.azimuth_rad, self._search.map(self._spans_s.index(bearing.span_s))
 
     def settle(self, call: bool, /) -> None:
         """Whether the frame was taken for a call: if not, it is noise to learn from, once `LAG_S` has shown
