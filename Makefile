@@ -126,6 +126,11 @@ wireshark: $(VENV)/.dev ## a Wireshark dissector of all our messages, build/loca
 	@mkdir -p build
 	$(BIN)/python -m locagen_edge.mavlink.build_dialect --lua build/locagen.lua
 
+.PHONY: denoisers
+denoisers: $(VENV)/.dev ## trains the denoisers anew on the recordings in SOUNDS, into build/ (hours)
+	for k in wave mask; do $(BIN)/locagen-lab denoise train $$k --settings models/denoise-$$k.toml \
+	    --calls $(SOUNDS)/signal --noise $(SOUNDS)/noise --out build/denoise-$$k || exit 1; done
+
 .PHONY: paper
 paper: $(VENV)/.dev ## repeats the paper's experiments, into paper-report/ (some minutes)
 	$(BIN)/locagen-lab paper --out paper-report

@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +51,49 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     return entries
 
 
+class Network:
+    """A checked model with states: what it says of a stream depends on what came before.
+
+    Its first output is the answer, the others are the states to give back with the next inputs.
+    """
+
+    def __init__(self, session: Any, entry: dict[str, Any]) -> None:
+        self._session = session
+        self._names = [tensor["name"] for tensor in entry["inputs"]]
+        self._shapes = [tensor["shape"] for tensor in entry["inputs"]]
+        self._states = len(entry["outputs"]) - 1
+
+    def zeros(self, **dimensions: int) -> list[F32]:
+        """The states before anything was heard; `dimensions`: sizes that the file leaves open, by name."""
+        return [
+            np.zeros([dimensions.get(d, 1) if isinstance(d, str) else d for d in shape], dtype=np.float32)
+            for shape in self._shapes[len(self._shapes) - self._states :]
+        ]
+
+    def __call__(self, inputs: Sequence[F32]) -> list[F32]:
+        """The answer and the next states, in the order of the manifest."""
+        outputs: list[F32] = self._session.run(None, dict(zip(self._names, inputs, strict=True)))
+        return outputs
+
+
 def load_model(name: str, settings: Settings) -> Model:
     """A checked model with one input, ready to call. Raises `ModelError`, naming the model and the reason."""
+    session, entry = _open(name, settings)
+    names = [entry["inputs"][0]["name"]]
+
+    def call(x: F32) -> list[F32]:
+        outputs: list[F32] = session.run(None, {names[0]: x})
+        return outputs
+
+    return call
+
+
+def load_network(name: str, settings: Settings) -> Network:
+    """A checked model with states. Raises `ModelError`, naming the model and the reason."""
+    return Network(*_open(name, settings))
+
+
+def _open(name: str, settings: Settings) -> tuple[Any, dict[str, Any]]:
     directory = directory_of(settings)
     entries = read_manifest(directory)
     if name not in entries:
@@ -77,13 +118,7 @@ def load_model(name: str, settings: Settings) -> Model:
         raise
     except Exception as error:  # onnxruntime raises a class of its own for each kind of broken file
         raise ModelError(f"model {name}: {entry.get('file')} cannot be loaded: {error}") from error
-    names = [entry["inputs"][0]["name"]]
-
-    def call(x: F32) -> list[F32]:
-        outputs: list[F32] = session.run(None, {names[0]: x})
-        return outputs
-
-    return call
+    return session, entry
 
 
 def _check_hash(name: str, content: bytes, wanted: str) -> None:
@@ -96,7 +131,9 @@ def _check_hash(name: str, content: bytes, wanted: str) -> None:
 
 
 def _check_array(name: str, positions_m: Any, settings: Settings) -> None:
-    """Only the shape counts: where the array sits, and 1 mm, make no difference to delays."""
+    """Only the shape counts: where the array sits, and 1 mm, do not matter to delays. None: any array."""
+    if positions_m is None:
+        return
     wanted = np.asarray(positions_m, dtype=np.float64)
     here = settings.mic_array.positions_m
     same = wanted.shape == here.shape and np.allclose(wanted - wanted[0], here - here[0], atol=1e-3)

@@ -15,6 +15,7 @@ from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing import make_locator
 from locagen_edge.stages.bearing.common import Locator
 from locagen_edge.stages.correlation import Correlator
+from locagen_edge.stages.denoise import MASKERS, Masker, WaveDenoiser
 from locagen_edge.stages.detection import Detector
 from locagen_edge.stages.faults import FaultFinder
 from locagen_edge.stages.position import Positioner, sighting
@@ -34,6 +35,7 @@ class Pipeline:
         self._settings = settings
         self._shape = (array.mics, audio.frame)
         self._hop_s = settings.hop_s
+        self._denoise, self._mask = _made_denoiser(settings)
         self._correlate, self._pick, self._locate = _made_for_array(settings)
         self._detect = Detector(settings.detection)
         self._find_faults = FaultFinder(settings)
@@ -58,9 +60,13 @@ class Pipeline:
         """
         if settings.audio != self._settings.audio:
             raise SettingsError("audio: cannot be changed while sound comes in")
+        denoiser = self._denoise, self._mask
+        if _for_denoiser(settings) != _for_denoiser(self._settings):
+            denoiser = _made_denoiser(settings)
         if _for_array(settings) != _for_array(self._settings):
             self._correlate, self._pick, self._locate = _made_for_array(settings)
             self._find_faults.apply(settings)
+        self._denoise, self._mask = denoiser
         self._settings = settings
         self._locate.apply(settings)
         self._detect.apply(settings.detection)
@@ -69,6 +75,7 @@ class Pipeline:
     def forget_noise(self) -> None:
         """Learns background and noise from nothing: call it between two frames."""
         self._locate.forget()
+        self._denoise, self._mask = _made_denoiser(self._settings)
         self._detect.forget()
 
     def process(self, frame: Frame, pose: Pose | None = None) -> Estimate:
@@ -82,11 +89,16 @@ class Pipeline:
             raise SourceError(f"a frame of shape {frame.samples.shape} came, settings say {self._shape}")
         elapsed_s = self._hop_s if self._last_ns is None else max(frame.t_ns - self._last_ns, 0) * 1e-9
         self._last_ns = frame.t_ns
+        if self._denoise is not None:
+            frame = self._denoise(frame)
+        mask = self._mask(frame) if self._mask is not None else None
         correlation = self._correlate(frame)
         tdoa = self._pick(correlation)
-        bearings = self._locate(frame, tdoa, elapsed_s)
+        bearings = self._locate(frame, tdoa, elapsed_s, mask)
         detection = self._detect(correlation, bearings[0], elapsed_s)
         self._locate.settle(detection.call)
+        if self._mask is not None:
+            self._mask.settle(detection.call)
         tracks = self._track(bearings, detection, elapsed_s, pose.attitude if pose else None)
         sightings = tuple(self._looks(tracks, pose))
         positions = (self._positioner.position(t.id, frame.middle_ns) for t in tracks if t.confirmed)
@@ -128,6 +140,18 @@ def _made_for_array(settings: Settings) -> tuple[Correlator, PeakPicker, Locator
         settings.correlation,
     )
     return Correlator(*shape), PeakPicker(*shape), make_locator(settings)
+
+
+def _made_denoiser(settings: Settings) -> tuple[WaveDenoiser | None, Masker | None]:
+    """What `denoise.kind` names: it cleans the sound, or it weighs the bearing's bins."""
+    kind = settings.denoise.kind
+    make_mask = MASKERS.get(kind)
+    return WaveDenoiser(settings) if kind == "wave" else None, make_mask(settings) if make_mask else None
+
+
+def _for_denoiser(settings: Settings) -> tuple[Any, ...]:
+    """What it is made of."""
+    return settings.denoise, settings.array, settings.correlation.band_hz, settings.models
 
 
 def _for_array(settings: Settings) -> tuple[Any, ...]:

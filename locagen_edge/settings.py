@@ -200,6 +200,33 @@ class SimSettings:
 
 
 @dataclass(frozen=True)
+class DenoiseSettings:
+    """Taking the rotors out of the sound, by networks that know them."""
+
+    kind: str = setting(
+        "none",
+        "`wave`: every microphone's sound goes through the paper's network before it is correlated, and "
+        "comes 6 ms later. `mask`: the sound stays as it is, and a network says which frequencies are the "
+        "caller's; `wiener`: the same from the spectrum of the noise alone, without a network. Both are for "
+        'bearing.estimator = "steered".',
+        choices=("none", "wave", "mask", "wiener"),
+    )
+    wave: str = setting("denoise-wave", "The model of `wave`.", pattern=NAME)
+    mask: str = setting(
+        "denoise-mask",
+        "The model of `mask`; `locagen-lab denoise tune` makes one for your drone.",
+        pattern=NAME,
+    )
+    forget_s: float = setting(
+        4.0,
+        "How fast the spectrum of the noise is learnt and forgotten, while nothing calls.",
+        unit="s",
+        least=0.2,
+        most=600,
+    )
+
+
+@dataclass(frozen=True)
 class CorrelationSettings:
     """GCC-PHAT of all pairs."""
 
@@ -636,6 +663,7 @@ class Settings:
     environment: EnvironmentSettings = EnvironmentSettings()
     audio: AudioSettings = AudioSettings()
     sim: SimSettings = SimSettings()
+    denoise: DenoiseSettings = DenoiseSettings()
     correlation: CorrelationSettings = CorrelationSettings()
     bearing: BearingSettings = BearingSettings()
     steered: SteeredSettings = SteeredSettings()
@@ -738,6 +766,7 @@ def _faults_between_fields(s: Settings) -> Iterator[str]:
             f"audio.channel_map: {len(s.audio.channel_map)} channels, "
             f"but array.positions_m has {len(s.array.positions_m)} microphones"
         )
+    yield from _faults_of_denoiser(s)
     if s.audio.source == "alsa" and max(s.audio.channel_map, default=0) >= s.audio.device_channels:
         yield (
             f"audio.channel_map: names channel {max(s.audio.channel_map)}, "
@@ -791,6 +820,24 @@ def _faults_of_array(s: Settings) -> Iterator[str]:
         yield (
             f"{key}: seen from above the microphones are on one line, "
             f"and bearing.estimator = {s.bearing.estimator!r} needs a plane"
+        )
+
+
+def _faults_of_denoiser(s: Settings) -> Iterator[str]:
+    """Masks weigh spectra; the networks know one rate, and take the sound by 512 samples."""
+    if s.denoise.kind in ("mask", "wiener") and s.bearing.estimator != "steered":
+        yield (
+            f"denoise.kind: {s.denoise.kind!r} needs bearing.estimator = 'steered': "
+            f"{s.bearing.estimator!r} has no use for a mask"
+        )
+    if s.denoise.kind not in ("wave", "mask"):
+        return
+    if s.audio.rate_hz != 10000:
+        yield f"denoise.kind: {s.denoise.kind!r} needs audio.rate_hz = 10000, not {s.audio.rate_hz}"
+    if s.audio.hop % 512 or s.audio.frame % 512:
+        yield (
+            f"denoise.kind: {s.denoise.kind!r} needs audio.hop and audio.frame to be multiples of 512, "
+            f"not {s.audio.hop} and {s.audio.frame}"
         )
 
 

@@ -142,6 +142,20 @@ class Detection:
     """for how long it has called, at the frame's end; 0 where nothing calls"""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Mask:
+    """What share of a frame's sound is the caller's, by frequency: the same for all microphones."""
+
+    t_ns: int
+    """that of the frame"""
+    weight: F32
+    """(frame / 2 + 1,) 0 to 1, of each bin of the frame's spectrum: the mean of `masks` over time"""
+    masks: F32
+    """(spectra, bins) 0 to 1, of the short spectra within the frame that the network has judged"""
+    snr_db: float
+    """in-band power kept over power taken away; -inf while the noise is not known"""
+
+
 @dataclass(frozen=True, slots=True)
 class TrueBearing:
     """A direction in earth axes. The sigmas hold the error of the vehicle's attitude, unless it is said

@@ -36,6 +36,8 @@ def modules_after(statement: str) -> set[str]:
         "import locagen_edge.stages.mic",
         "import locagen_edge.store.recorder",
         "from locagen_edge.pipeline import Pipeline; from locagen_edge.settings import from_table; "
+        "Pipeline(from_table({'denoise': {'kind': 'wave'}}))",
+        "from locagen_edge.pipeline import Pipeline; from locagen_edge.settings import from_table; "
         "Pipeline(from_table({'bearing': {'estimator': 'model:tdoa-mlp'}}))",
     ],
 )
@@ -65,6 +67,7 @@ GROUND = {
     "files",
     "jsonl",
     "poses",
+    "highpass",
 }
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),

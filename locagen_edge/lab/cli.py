@@ -11,6 +11,7 @@ from pathlib import Path
 from locagen_edge.errors import LocagenError, SettingsError
 from locagen_edge.files import write
 from locagen_edge.lab import dataset_cli, refine_cli
+from locagen_edge.lab.denoise import cli as denoise_cli
 from locagen_edge.lab.settings import OWN, PAPER, read
 
 
@@ -106,6 +107,7 @@ def _parser() -> argparse.ArgumentParser:
                           help="where to write (default: field-report)")  # fmt: skip
     evaluate.set_defaults(command=_evaluate)
     dataset_cli.add_command(commands)
+    denoise_cli.add_command(commands, common)
     refine_cli.add_command(commands)
     return parser
 

@@ -28,18 +28,30 @@ TYPES = {onnx.TensorProto.FLOAT: "tensor(float)"}
 
 def to_onnx(module: torch.nn.Module, example: torch.Tensor, input_name: str, output_name: str) -> bytes:
     """The module as an ONNX file for tensors of the example's very shape. Same module, same bytes."""
+    return to_onnx_with_states(module, (example,), [input_name], [output_name])
+
+
+def to_onnx_with_states(
+    module: torch.nn.Module,
+    examples: tuple[torch.Tensor, ...],
+    inputs: list[str],
+    outputs: list[str],
+    open_dimensions: Any = None,
+) -> bytes:
+    """The same for a module of several tensors. `open_dimensions`: as torch's `dynamic_shapes`."""
     # torchvision's absence is reported at every export; the warning concerns torch's own pytree
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
         program = torch.onnx.export(
             module.eval(),
-            (example,),
+            examples,
             dynamo=True,
             verbose=False,
             opset_version=OPSET,
-            input_names=[input_name],
-            output_names=[output_name],
+            input_names=inputs,
+            output_names=outputs,
+            dynamic_shapes=open_dimensions,
         )
     assert program is not None
     proto = program.model_proto
@@ -52,8 +64,8 @@ def to_onnx(module: torch.nn.Module, example: torch.Tensor, input_name: str, out
     return content
 
 
-def install(name: str, content: bytes, positions_m: np.ndarray, card: str, directory: Path) -> None:
-    """Puts a model into the directory and its manifest: file, sha256, tensors, array, card."""
+def install(name: str, content: bytes, positions_m: np.ndarray | None, card: str, directory: Path) -> None:
+    """Puts a model into the directory and its manifest: file, sha256, tensors, array (None: any), card."""
     graph = onnx.load_model_from_string(content).graph
     path = directory / MANIFEST
     manifest: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"models": {}}
@@ -62,7 +74,7 @@ def install(name: str, content: bytes, positions_m: np.ndarray, card: str, direc
         "sha256": hashlib.sha256(content).hexdigest(),
         "inputs": [_tensor(value) for value in graph.input],
         "outputs": [_tensor(value) for value in graph.output],
-        "array_m": np.round(positions_m, 6).tolist(),
+        "array_m": None if positions_m is None else np.round(positions_m, 6).tolist(),
         "card": f"{name}.md",
     }
     write(directory / f"{name}.onnx", content)
@@ -83,5 +95,5 @@ def _tensor(value: Any) -> dict[str, Any]:
     return {
         "name": value.name,
         "type": TYPES[tensor.elem_type],
-        "shape": [d.dim_value for d in tensor.shape.dim],
+        "shape": [d.dim_param or d.dim_value for d in tensor.shape.dim],
     }

@@ -27,16 +27,22 @@ def load(folder: str, rate_hz: int) -> tuple[tuple[str, F32], ...]:
         raise DatasetError(f"scene.recordings: no {', '.join(ENDINGS)} file in {folder}")
     sounds = []
     for file in files:
-        try:
-            sound, file_hz = soundfile.read(file, dtype="float32", always_2d=True)
-        except (soundfile.LibsndfileError, OSError) as error:
-            raise DatasetError(f"{file}: cannot be read: {error}") from error
-        mono = np.asarray(soxr.resample(sound.mean(axis=1), file_hz, rate_hz), dtype=np.float32)
+        mono = read_sound(file, rate_hz)
         if mono.any():  # a file of zeros cannot call
             sounds.append((file.relative_to(folder).as_posix(), mono))
     if not sounds:
         raise DatasetError(f"scene.recordings: nothing but silence in {folder}")
     return tuple(sounds)
+
+
+def read_sound(file: Path, rate_hz: int) -> F32:
+    """(n,) mean of the channels. Raises `DatasetError` where it cannot be read."""
+    try:
+        sound, file_hz = soundfile.read(file, dtype="float32", always_2d=True)
+    except (soundfile.LibsndfileError, OSError) as error:
+        raise DatasetError(f"{file}: cannot be read: {error}") from error
+    mono = np.nan_to_num(sound, posinf=0.0, neginf=0.0).mean(axis=1)
+    return np.asarray(soxr.resample(mono, file_hz, rate_hz), dtype=np.float32)
 
 
 def fingerprint(folder: str, rate_hz: int) -> str:

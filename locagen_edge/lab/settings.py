@@ -128,6 +128,90 @@ class FilterSettings:
 
 
 @dataclass(frozen=True)
+class MixesSettings:
+    """What denoisers learn from: calls and noise, mixed anew for every step."""
+
+    calls: str = setting(
+        "", "Folder of clean sounds, one folder below it for each class; empty: all classes are synthesised."
+    )
+    noise: str = setting("", "Folder of noise without calls; empty: rotors that follow throttle.")
+    drones: tuple[str, ...] = setting(
+        ("*",), "Patterns of the noise recordings that are drones; others are background to be added to them."
+    )
+    held_out: tuple[str, ...] = setting(
+        (),
+        "Patterns of noise recordings that are kept for evaluation, one pattern for each drone. Empty: every "
+        "fifth recording, by name. Of calls every fifth recording of a class is kept.",
+    )
+    unheard: tuple[str, ...] = setting((), "Classes of calls that are for evaluation only.")
+    snr_db: tuple[float, ...] = setting(
+        (-15.0, 15.0), "Lowest and highest level of the call over the noise.", unit="dB", least=-60, most=60
+    )
+    clip_s: float = setting(2.25, "Length of a clip; the paper's.", unit="s", least=0.5, most=60)
+    before_s: float = setting(
+        2.5, "Noise alone before it, from which its spectrum is known.", unit="s", least=0.1, most=60
+    )
+    alter: float = setting(
+        1.0,
+        "How much noise recordings are altered in speed, colour and loudness: 1 makes other drones of "
+        "them, for "
+        "a network that has to meet unknown ones; less keeps known drones as they are.",
+        least=0, most=1,
+    )  # fmt: skip
+    pool: int = setting(
+        500, "Clips of each kind in memory; every step replaces some.", unit="clips", least=4, most=100_000
+    )
+    seed: int = setting(1, "Same seed, same mixes.", least=0, most=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How a denoiser is trained: AdamW, and a smaller rate where the validation loss stands still."""
+
+    width: int = setting(64, "Features between the layers.", least=4, most=1024)
+    rate: float = setting(2e-3, "First learning rate of AdamW.", least=1e-7, most=1)
+    batch: int = setting(16, "Clips in a step.", unit="clips", least=1, most=4096)
+    steps: int = setting(4000, "Steps at most.", unit="steps", least=0, most=10_000_000)
+    check: int = setting(100, "Steps between two validations.", unit="steps", least=1, most=1_000_000)
+    patience: int = setting(
+        3, "Validations without a better one before the rate is halved.", least=1, most=1000
+    )
+    threads: int = setting(1, "Threads to train with.", unit="threads", least=1, most=256)
+    seed: int = setting(1, "Of the weights.", least=0, most=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class WaveSettings(FitSettings):
+    """The paper's denoiser, from waveform to waveform."""
+
+    si_snr_share: float = setting(
+        0.2,
+        "Share of the SI-SNR in the loss, the paper's; the rest is the mean absolute error. SI-SNR counts in "
+        "dB, the error in units of the clean sound's mean absolute value.",
+        least=0, most=1,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MaskSettings(FitSettings):
+    """The denoiser that serves the bearing: one mask for all microphones, told the noise's spectrum."""
+
+    width: int = setting(40, "Numbers that describe a band.", least=4, most=1024)
+    blocks: int = setting(
+        2, "Pairs of a recurrent layer over time and a dense one over bands.", least=1, most=8
+    )
+    batch: int = setting(12, "Clips in a step.", unit="clips", least=1, most=4096)
+    rate: float = setting(3e-3, "First learning rate of AdamW.", least=1e-7, most=1)
+    gain_weight: float = setting(
+        4.0,
+        "Weight of (1 - gain on the call)^2, times the call's share of the mixture, beside the SI-SDR in "
+        "units of 10 dB.",
+        least=0,
+        most=1000,
+    )
+
+
+@dataclass(frozen=True)
 class LabSettings(Settings):
     """All settings of the flight and of the workshop. Every section and every key may be left out."""
 
@@ -139,6 +223,9 @@ class LabSettings(Settings):
     mlp: MlpSettings = MlpSettings()
     siren: SirenSettings = SirenSettings()
     filter: FilterSettings = FilterSettings()
+    mixes: MixesSettings = MixesSettings()
+    wave: WaveSettings = WaveSettings()
+    mask: MaskSettings = MaskSettings()
 
     def __post_init__(self) -> None:
         faults: list[str] = []
@@ -148,6 +235,7 @@ class LabSettings(Settings):
             faults += str(error).splitlines()
         faults += _faults_of_twin(self)
         faults += _faults_of_scene(self)
+        faults += _faults_of_mixes(self)
         if faults:
             raise SettingsError("\n".join(faults))
 
@@ -200,6 +288,14 @@ def _faults_of_scene(s: LabSettings) -> Iterator[str]:
         nearest = np.linalg.norm((places - places.mean(axis=0))[:, None] - hubs, axis=2).min()
         if nearest < NEAREST_HUB_M + s.twin.position_error_m:
             yield f"scene.rotor_arm_m: puts a hub {nearest:.3g} m from a microphone"
+
+
+def _faults_of_mixes(s: LabSettings) -> Iterator[str]:
+    snr_db = s.mixes.snr_db
+    if len(snr_db) != 2 or not snr_db[0] <= snr_db[1]:
+        yield f"mixes.snr_db: {list(snr_db)} is not a lowest and a highest SNR"
+    if not s.mixes.drones:
+        yield "mixes.drones: is empty"
 
 
 def _smallest_spacing(s: LabSettings) -> float:

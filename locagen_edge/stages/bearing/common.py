@@ -11,7 +11,7 @@ import numpy as np
 
 from locagen_edge.geometry import MicArray
 from locagen_edge.settings import Settings
-from locagen_edge.types import F64, Bearing, Evidence, Frame, Tdoa
+from locagen_edge.types import F64, Bearing, Evidence, Frame, Mask, Tdoa
 
 Estimator = Callable[[Tdoa], Bearing]
 """From delays to a direction, frame by frame."""
@@ -20,9 +20,11 @@ Estimator = Callable[[Tdoa], Bearing]
 class Locator(Protocol):
     """What the pipeline asks for bearings, once a frame."""
 
-    def __call__(self, frame: Frame, tdoa: Tdoa, elapsed_s: float, /) -> tuple[Bearing, ...]:
+    def __call__(
+        self, frame: Frame, tdoa: Tdoa, elapsed_s: float, mask: Mask | None = None, /
+    ) -> tuple[Bearing, ...]:
         """Of the sources in the frame, the strongest first; at least one, if only to say "no bearing".
-        `elapsed_s`: since the previous frame."""
+        `elapsed_s`: since the previous frame. `mask`: what of the frame is a caller's; None: not known."""
         ...
 
     def settle(self, call: bool, /) -> None:
@@ -41,7 +43,7 @@ class OnDelays:
     def __init__(self, estimate: Estimator):
         self._estimate = estimate
 
-    def __call__(self, _: Frame, tdoa: Tdoa, __: float, /) -> tuple[Bearing, ...]:
+    def __call__(self, _: Frame, tdoa: Tdoa, __: float, ___: Mask | None = None, /) -> tuple[Bearing, ...]:
         return (self._estimate(tdoa),)
 
     def settle(self, _: bool, /) -> None:

@@ -21,7 +21,7 @@ from locagen_edge.kernel import Source, Steered
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import LARGEST_AZIMUTH_SIGMA_RAD, NOWHERE_RAD, no_bearing
 from locagen_edge.stages.bearing.evidence import Onsets, Usual
-from locagen_edge.types import F32, F64, Bearing, Evidence, Frame, Tdoa
+from locagen_edge.types import F32, F64, Bearing, Evidence, Frame, Mask, Tdoa
 
 NAME = "steered"
 
@@ -81,12 +81,16 @@ class SteeredLocator:
         self._grid_u = np.stack(
             [direction(float(a), float(e)) for a, e in zip(columns.ravel(), rows.ravel(), strict=True)]
         )
+        first = self._search.first_bin
+        self._band = slice(first, first + len(self._search.frequency_hz))
+        self._weights: F32 = np.ones((len(self._spans_s), len(self._search.frequency_hz)), dtype=np.float32)
         places_m = settings.mic_array.positions_m - settings.mic_array.positions_m.mean(axis=0)
         self._spread_m2: F64 = places_m.T @ places_m
         self._tolerance_m = settings.array.tolerance_m
         self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
         self._mics = settings.mic_array.mics
         self._elapsed_s = 0.0
+        self._mask: Mask | None = None
         # A microphone that fails for a moment must not be missing from the matrix for long after; one that
         # has failed for good must not keep the others from learning.
         self._bad_hops = 0
@@ -125,13 +129,16 @@ class SteeredLocator:
         self._search.reset()
         self._know_nothing()
 
-    def __call__(self, frame: Frame, _: Tdoa, elapsed_s: float, /) -> tuple[Bearing, ...]:
+    def __call__(
+        self, frame: Frame, _: Tdoa, elapsed_s: float, mask: Mask | None = None, /
+    ) -> tuple[Bearing, ...]:
         power, bad_mics = self._search.listen(frame.samples)
         failing = bad_mics != 0 or power.min() < DEAD * power.max()
         self._bad_hops = self._bad_hops + 1 if failing else 0
         self._failing.append(bool(failing))
         self._silent.append(bool(power.max() < SILENCE))
         self._elapsed_s = elapsed_s
+        self._mask = mask
         if elapsed_s > LAG_S:
             self._onsets.forget()
         found = [self._heard(span, elapsed_s) for span in range(len(self._spans_s))]
@@ -154,7 +161,8 @@ class SteeredLocator:
             # an average over a second remembers what has ended
             if span == 0 or self._onsets.going_on(towards):
                 evidence = Evidence(ratios[span], self._onsets.since_s(towards))
-                return tuple(self._told(source, span, evidence) for source in found[span])
+                sources = found[span] if self._mask is None else self._placed(found[span], span)
+                return tuple(self._told(source, span, evidence) for source in sources)
         return ()
 
     def _end_of_a_loud_call(self) -> None:
@@ -176,8 +184,12 @@ class SteeredLocator:
     def _heard(self, span: int, elapsed_s: float) -> list[Source]:
         """The callers in one span; none where the noise alone is as good a reason."""
         span_s = self._spans_s[span]
-        self._search.hear(1.0 - math.exp(-elapsed_s / span_s) if span_s > 0.0 else 1.0, span)
-        sources = self._search.search(2, span, MEANING * self._usual[span].known)
+        share = 1.0 - math.exp(-elapsed_s / span_s) if span_s > 0.0 else 1.0
+        self._search.hear(share, span)
+        if self._mask is not None:
+            weight = np.square(self._mask.weight[self._band])  # a gain's square is what is left of power
+            self._weights[span] += np.float32(share) * (weight - self._weights[span])
+        sources = self._sources(span)
         scores: F32 = self._search.map(span)
         if span == 0:
             self._onsets.hear(scores)
@@ -190,6 +202,22 @@ class SteeredLocator:
             return []
         least = max(SECOND * sources[0].score, self._least_ratio * self._usual[span].level)
         return [s for n, s in enumerate(sources) if n == 0 or s.score > least]
+
+    def _sources(self, span: int) -> tuple[Source, ...]:
+        return self._search.search(2, span, MEANING * self._usual[span].known)
+
+    def _placed(self, found: list[Source], span: int) -> list[Source]:
+        """Callers once more, by the bins that are theirs; as they were found where those hold too little.
+
+        Whether something calls has been decided without the mask, which can neither make a call nor hide one.
+        """
+        if self._ratios()[span] < self._least_ratio:
+            return found
+        self._search.weigh(self._weights[span])
+        placed = self._sources(span)
+        self._search.weigh(np.ones_like(self._weights[span]))
+        too_little = len(placed) < len(found) or placed[0].rival > RIVAL
+        return found if too_little else list(placed[: len(found)])
 
     def _nearest(self, source: Source) -> int:
         """On the grid."""

@@ -1,0 +1,3 @@
+"""Denoisers: sounds, mixes on the fly, training, export, evaluation beside peers, tuning on one's own
+drone.
+"""

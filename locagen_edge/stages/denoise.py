@@ -1,0 +1,352 @@
+"""Frame -> Frame, or Frame -> Mask: takes the rotors out of the sound and leaves caller and phases.
+
+    wave    the paper's network: each microphone's waveform through the same weights. The sound comes out
+            WAVE_DELAY samples later. Bearings from it want a correlation that does not whiten: PHAT divides
+            out just what the denoiser did.
+    mask    one mask for all microphones in time and frequency, from their spectra over that of the noise,
+    which is learnt while nothing calls. It touches no phase: weigh cross-spectra with it, tell calls by it,
+    or hear the cleaned sound, MASK_DELAY samples later.
+    wiener  the same kind of answer without a network: Wiener's gain of each bin of the frame's own spectrum.
+
+The networks hear everything through the same high-pass, keep their state from frame to frame, and begin anew
+after a gap. A sample that is not finite counts as silence inside, and is not finite again in the sound that
+comes out, so that the microphone's failure is seen by those who look for it and spoils nothing later.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from locagen_edge.highpass import HighPass
+from locagen_edge.models import Network, load_network
+from locagen_edge.settings import Settings
+from locagen_edge.types import F32, F64, Array, Frame, Mask
+
+RATE_HZ = 10_000
+HIGH_PASS_HZ = 80.0
+CHUNK = 512
+"""samples of one call of either network"""
+
+WAVE_DELAY = 64
+"""half of the network's first window, 6.4 ms"""
+
+WINDOW = 256
+STEP = 128
+BINS = WINDOW // 2
+"""of a spectrum, without 0 Hz"""
+LOOKAHEAD = 3
+"""spectra after the one whose mask is given"""
+MASK_DELAY = STEP * (1 + LOOKAHEAD)
+"""overlap-add and LOOKAHEAD: 51.2 ms, one hop"""
+
+LOUDEST = 8.0
+"""Of full scale. No converter gives more; what comes as more would overflow inside."""
+DEAD = 1e-6
+"""Of its own noise's power, -60 dB: a microphone as quiet as that has died."""
+LEAST = 1e-17
+"""Power of a spectrum, about -180 dBFS: digital silence, which has no noise to be told from."""
+EARLIEST_S = 0.5
+"""Noise that has to be known before a mask is given; it then still varies by 2 dB from bin to bin."""
+
+
+def window() -> F64:
+    """(WINDOW,) square root of Hann: twice applied and overlapped by half it adds up to 1."""
+    taper: F64 = np.sin(np.pi * (np.arange(WINDOW) + 0.5) / WINDOW)
+    return taper
+
+
+# --- what is new in a frame ---------------------------------------------------------------------------
+
+
+class NewSound:
+    """The samples that each frame adds to those before, high-passed and finite."""
+
+    def __init__(self, mics: int) -> None:
+        self._high_pass = HighPass(HIGH_PASS_HZ, RATE_HZ, mics)
+        self._end: int | None = None
+
+    def __call__(self, frame: Frame) -> tuple[F32, bool]:
+        """(mics, CHUNK * k), and whether a new stream begins with it: all of the frame is new then."""
+        end = frame.start + frame.samples.shape[1]
+        new = frame.samples.shape[1] if self._end is None else end - self._end
+        fresh = frame.overruns > 0 or not 0 < new < frame.samples.shape[1] or new % CHUNK != 0
+        self._end = end
+        if fresh:
+            self._high_pass.reset()
+            new = frame.samples.shape[1]
+        return self._high_pass(finite(frame.samples[:, -new:])), fresh
+
+
+def finite(sound: F32) -> F32:
+    """The same, with silence for what is no number and no more than LOUDEST."""
+    return np.clip(np.where(np.isfinite(sound), sound, np.float32(0.0)), -LOUDEST, LOUDEST)
+
+
+# --- wave ---------------------------------------------------------------------------------------------
+
+
+class WaveStream:
+    """The waveform network over chunks of a stream."""
+
+    def __init__(self, network: Network, mics: int) -> None:
+        self._network = network
+        self._mics = mics
+        self.reset()
+
+    def reset(self) -> None:
+        """Silence before the next chunk."""
+        self._states = self._network.zeros(mics=self._mics)
+
+    def __call__(self, sound: F32) -> F32:
+        """(mics, CHUNK * k) to the clean sound WAVE_DELAY earlier, (mics, CHUNK * k)."""
+        clean = []
+        for first in range(0, sound.shape[1], CHUNK):
+            out, *self._states = self._network([sound[:, first : first + CHUNK], *self._states])
+            clean.append(out)
+        return np.concatenate(clean, axis=1)
+
+
+class WaveDenoiser:
+    """Frames of noisy sound to frames of clean sound, WAVE_DELAY samples earlier in time."""
+
+    def __init__(self, settings: Settings) -> None:
+        mics = settings.mic_array.mics
+        self._new = NewSound(mics)
+        self._stream = WaveStream(load_network(settings.denoise.wave, settings), mics)
+        self._held: F32 = np.zeros((mics, settings.audio.frame), dtype=np.float32)
+        self._failed: F32 = np.zeros((mics, settings.audio.frame + WAVE_DELAY), dtype=np.float32)
+
+    def __call__(self, frame: Frame) -> Frame:
+        sound, fresh = self._new(frame)
+        if fresh:
+            self._stream.reset()
+            self._failed[:] = 0.0
+        new = sound.shape[1]
+        self._held = _shifted(self._held, self._stream(sound))
+        # 0 where the input is finite, NaN where not
+        failed = np.where(np.isfinite(frame.samples[:, -new:]), np.float32(0.0), np.float32(np.nan))
+        self._failed = _shifted(self._failed, failed)
+        samples = self._held + self._failed[:, : self._held.shape[1]]
+        earlier_ns = round(WAVE_DELAY * 1e9 / frame.rate_hz)
+        return replace(frame, samples=samples, start=frame.start - WAVE_DELAY, t_ns=frame.t_ns - earlier_ns)
+
+
+def _shifted(held: F32, new: F32) -> F32:
+    """The last of both, as many as are held."""
+    return np.concatenate([held, new], axis=1)[:, -held.shape[1] :]
+
+
+# --- mask ---------------------------------------------------------------------------------------------
+
+
+class NoiseSpectrum:
+    """Mean power spectrum of each microphone over the noise that it was told of.
+
+    A plain mean at first, then one that forgets.
+    """
+
+    def __init__(self, mics: int, forget_spectra: float, bins: int = BINS + 1) -> None:
+        self._share = 1.0 - math.exp(-1.0 / forget_spectra)
+        self.mean: F64 = np.zeros((mics, bins))
+        """(mics, bins)"""
+        self.spectra: F64 = np.zeros(mics)
+        """(mics,) learnt from"""
+
+    def learn(self, power: F64) -> None:
+        """Takes (mics, spectra, bins) as noise. Silence teaches nothing: it is a failing input."""
+        alive = power.sum(axis=2) > LEAST
+        for k in range(power.shape[1]):
+            live = alive[:, k]
+            self.spectra += live
+            share = np.maximum(1.0 / np.maximum(self.spectra, 1.0), self._share) * live
+            self.mean += share[:, np.newaxis] * (power[:, k] - self.mean)
+
+    def relative(self, power: F64, earliest: float) -> tuple[F64, F64] | None:
+        """Of (mics, spectra, bins): power over noise (spectra, bins), and the noise's shape (bins,), both
+        means over those microphones that live and whose noise is known from `earliest` spectra or more;
+        None where there is none."""
+        level = self.mean.sum(axis=1)
+        live = (self.spectra >= earliest) & (power.sum(axis=(1, 2)) > DEAD * level)
+        if not live.any():
+            return None
+        known = self.mean[live] + 1e-10 * level[live, np.newaxis] / (self.mean.shape[1] - 1)
+        relative = np.minimum((power[live] / known[:, np.newaxis]).mean(axis=0), 1e12)
+        return relative, (known / known.sum(axis=1, keepdims=True)).mean(axis=0)
+
+
+class MaskStream:
+    """The mask network over chunks of a stream."""
+
+    def __init__(self, network: Network, mics: int, forget_s: float = 4.0) -> None:
+        self._network = network
+        self._taper = window()
+        self._mics = mics
+        self.noise = NoiseSpectrum(mics, forget_s * RATE_HZ / STEP)
+        self._earliest = EARLIEST_S * RATE_HZ / STEP
+        self.reset()
+
+    def reset(self) -> None:
+        """Silence before the next chunk; the noise stays known."""
+        self._states = self._network.zeros()
+        self._held: F32 = np.zeros((self._mics, WINDOW - STEP), dtype=np.float32)
+        self._waiting = np.zeros((self._mics, LOOKAHEAD, BINS + 1), dtype=np.complex64)
+        self._overlap: F64 = np.zeros((self._mics, STEP))
+
+    def __call__(self, sound: F32) -> tuple[Array, F32]:
+        """Of (mics, CHUNK * k): spectra (mics, 4 k, BINS + 1) that end with each STEP of it, and the mask
+        (4 k, BINS + 1) of those that came LOOKAHEAD earlier.
+
+        Without live microphones, or before EARLIEST_S of noise is known, the mask is 1 throughout.
+        """
+        long = np.concatenate([self._held, sound], axis=1)
+        self._held = long[:, -(WINDOW - STEP) :]
+        pieces = np.lib.stride_tricks.sliding_window_view(long, WINDOW, axis=1)[:, ::STEP]
+        spectra = np.fft.rfft(pieces * self._taper, axis=2)
+        power = np.square(spectra.real) + np.square(spectra.imag)
+        at = range(0, power.shape[1], CHUNK // STEP)
+        return spectra, np.concatenate([self._mask(power[:, k : k + CHUNK // STEP]) for k in at])
+
+    def _mask(self, power: F64) -> F32:
+        mask = np.ones((power.shape[1], BINS + 1), dtype=np.float32)
+        heard = self.noise.relative(power, self._earliest)
+        if heard is None:
+            return mask
+        relative, shape = heard
+        found, *self._states = self._network(
+            [
+                relative[np.newaxis, :, 1:].astype(np.float32),
+                shape[np.newaxis, 1:].astype(np.float32),
+                *self._states,
+            ]
+        )
+        mask[:, 1:] = found[0]
+        mask[:, 0] = 0.0
+        return mask
+
+    def cleaned(self, spectra: Array, mask: F32) -> F32:
+        """The sound MASK_DELAY before the chunk that both came of: (mics, CHUNK * k)."""
+        waiting = np.concatenate([self._waiting, spectra], axis=1)
+        self._waiting = waiting[:, spectra.shape[1] :]
+        pieces = np.fft.irfft(waiting[:, : spectra.shape[1]] * mask, axis=2) * self._taper
+        before = np.concatenate([self._overlap[:, np.newaxis], pieces[:, :-1, STEP:]], axis=1)
+        self._overlap = pieces[:, -1, STEP:]
+        clean: F32 = (pieces[:, :, :STEP] + before).reshape(self._mics, -1).astype(np.float32)
+        return clean
+
+
+class MaskDenoiser:
+    """Frames to masks. `settle` tells it whether the frame was a call: if not, it is noise to learn from."""
+
+    def __init__(self, settings: Settings) -> None:
+        mics, audio = settings.mic_array.mics, settings.audio
+        self._new = NewSound(mics)
+        self._stream = MaskStream(
+            load_network(settings.denoise.mask, settings), mics, settings.denoise.forget_s
+        )
+        self._frame = audio.frame
+        per_frame = (audio.frame - WINDOW) // STEP + 1
+        self._masks: F32 = np.ones((per_frame, BINS + 1), dtype=np.float32)
+        self._power: F64 = np.zeros((per_frame, BINS + 1))
+        self._ended: F64 = np.zeros((mics, 0, BINS + 1))
+        at = np.arange(audio.frame // 2 + 1) * (WINDOW / audio.frame)
+        self._low = np.minimum(at.astype(np.intp), BINS - 1)
+        self._share = (at - self._low).astype(np.float32)
+        low, high = settings.correlation.band_hz
+        bins = np.arange(BINS + 1) * (RATE_HZ / WINDOW)
+        self._band = (bins >= low) & (bins <= high)
+
+    def __call__(self, frame: Frame) -> Mask:
+        sound, fresh = self._new(frame)
+        if fresh:
+            self._stream.reset()
+            self._masks[:] = 1.0
+            self._power[:] = 0.0
+        spectra, mask = self._stream(sound)
+        power = np.square(spectra.real) + np.square(spectra.imag)
+        self._ended = power
+        self._masks = np.concatenate([self._masks, mask])[-len(self._masks) :]
+        self._power = np.concatenate([self._power, power.mean(axis=0)])[-len(self._power) :]
+        # mask k belongs to the spectrum LOOKAHEAD before: the frame's first ones have theirs
+        masks, heard = self._masks[LOOKAHEAD:], self._power[:-LOOKAHEAD]
+        coarse = masks.mean(axis=0)
+        weight = coarse[self._low] * (1.0 - self._share) + coarse[self._low + 1] * self._share
+        call = float((masks * heard)[:, self._band].sum())
+        rest = float(((1.0 - masks) * heard)[:, self._band].sum())
+        ready = bool((self._stream.noise.spectra * STEP >= EARLIEST_S * RATE_HZ).any())
+        return Mask(
+            frame.t_ns,
+            weight,
+            masks,
+            10.0 * math.log10((call + LEAST) / (rest + LEAST)) if ready else -math.inf,
+        )
+
+    def settle(self, call: bool, /) -> None:
+        """Learns the frame's new spectra as noise where it held no call."""
+        if not call:
+            self._stream.noise.learn(self._ended)
+
+
+# --- Wiener -------------------------------------------------------------------------------------------
+
+SMOOTH_BINS = 6
+"""Bins to each side over which power is averaged: with three microphones it varies by 16 % then."""
+
+
+class WienerDenoiser:
+    """Wiener's gain 1 - noise / power of each bin of a frame's own spectrum: what a network has to beat
+    (Wiener, *Extrapolation, Interpolation, and Smoothing of Stationary Time Series*, 1949, chapter 3).
+
+    Knows no past but the noise. `settle` as for the mask.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        audio = settings.audio
+        self._taper = np.sin(np.pi * (np.arange(audio.frame) + 0.5) / audio.frame) ** 2
+        self._noise = NoiseSpectrum(
+            settings.mic_array.mics, settings.denoise.forget_s / settings.hop_s, audio.frame // 2 + 1
+        )
+        self._earliest = EARLIEST_S / settings.hop_s
+        self._kernel = np.ones(2 * SMOOTH_BINS + 1)
+        self._of = np.convolve(np.ones(audio.frame // 2 + 1), self._kernel, "same")
+        low, high = settings.correlation.band_hz
+        frequency = np.fft.rfftfreq(audio.frame, 1.0 / audio.rate_hz)
+        self._band = (frequency >= low) & (frequency <= high)
+        self._power: F64 = np.zeros((settings.mic_array.mics, 1, audio.frame // 2 + 1))
+
+    def __call__(self, frame: Frame) -> Mask:
+        spectra = np.fft.rfft(finite(frame.samples) * self._taper)
+        self._power = (np.square(spectra.real) + np.square(spectra.imag))[:, np.newaxis]
+        heard = self._noise.relative(self._power, self._earliest)
+        if heard is None:
+            weight = np.ones(self._power.shape[2], dtype=np.float32)
+            return Mask(frame.t_ns, weight, weight[np.newaxis], -math.inf)
+        relative = np.convolve(heard[0][0], self._kernel, "same") / self._of
+        gain = np.maximum(1.0 - 1.0 / np.maximum(relative, 1e-9), 0.0)
+        power = self._power.mean(axis=(0, 1))[self._band]
+        call, rest = float(gain[self._band] @ power), float((1.0 - gain[self._band]) @ power)
+        weight = gain.astype(np.float32)
+        snr_db = 10.0 * math.log10((call + LEAST) / (rest + LEAST))
+        return Mask(frame.t_ns, weight, weight[np.newaxis], snr_db)
+
+    def settle(self, call: bool, /) -> None:
+        """Learns the frame as noise where it held no call."""
+        if not call:
+            self._noise.learn(self._power)
+
+
+class Masker(Protocol):
+    """What the pipeline asks for masks, once a frame."""
+
+    def __call__(self, frame: Frame, /) -> Mask: ...
+
+    def settle(self, call: bool, /) -> None:
+        """Told afterwards whether the frame was taken for a call."""
+
+
+MASKERS: dict[str, Callable[[Settings], Masker]] = {"mask": MaskDenoiser, "wiener": WienerDenoiser}
+"""By `denoise.kind`."""
