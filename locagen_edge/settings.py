@@ -316,7 +316,8 @@ class DetectionSettings:
     evidence: float = setting(
         5.0,
         "Estimator `steered`: how many times what noise alone scores a direction has to score to be a call. "
-        "5 gives less than one false call in an hour of rotors; 4 hears further.",
+        "5 gives no false call in half an hour of rotors that hover; 4 hears further, 8 is for rotors "
+        "that hunt.",
         unit="times", least=1, most=1000,
     )  # fmt: skip
     snr_db: float = setting(
