@@ -413,25 +413,30 @@ int locagen_steer_learn(locagen_steer *memory, float share)
     return LOCAGEN_OK;
 }
 
-static locagen_span *span_of(steer *s, int32_t span)
+/* The span that a caller means, or why there is none. */
+static int find_span(locagen_steer *memory, int32_t span, steer **s, locagen_span **x)
 {
-    return span >= 0 && span < s->spans ? &s->span[span] : NULL;
+    if (memory == NULL)
+        return LOCAGEN_E_NULL;
+    *s = state_of(memory);
+    if (span < 0 || span >= (*s)->spans)
+        return LOCAGEN_E_SPAN;
+    *x = &(*s)->span[span];
+    return LOCAGEN_OK;
 }
 
 int locagen_steer_hear(locagen_steer *memory, int32_t span, float share)
 {
-    if (memory == NULL)
-        return LOCAGEN_E_NULL;
-    steer *s = state_of(memory);
-    locagen_span *x = span_of(s, span);
-    if (x == NULL)
-        return LOCAGEN_E_SPAN;
+    steer *s;
+    locagen_span *x;
+    int error = find_span(memory, span, &s, &x);
+    if (error != LOCAGEN_OK)
+        return error;
     if (!within(share, 0, 1))
         return LOCAGEN_E_SHARE;
     add(s, s->slot, share, x->signal, x->lost, &x->heard, &x->heard_variance, x->heard_weights);
     return LOCAGEN_OK;
 }
-
 
 int locagen_steer_weigh(locagen_steer *memory, const float *weight)
 {
@@ -541,12 +546,11 @@ static long spread_count(const steer *s)
 
 int locagen_steer_watch(locagen_steer *memory, int32_t span)
 {
-    if (memory == NULL)
-        return LOCAGEN_E_NULL;
-    steer *s = state_of(memory);
-    locagen_span *x = span_of(s, span);
-    if (x == NULL)
-        return LOCAGEN_E_SPAN;
+    steer *s;
+    locagen_span *x;
+    int error = find_span(memory, span, &s, &x);
+    if (error != LOCAGEN_OK)
+        return error;
     if (x->heard <= 0 || s->learnt <= 0)
         return LOCAGEN_OK;
     s->paths->add_squares(spread_count(s), over_theory(s, x), MOST_OVER, x->over, x->aside[0]);
@@ -556,12 +560,11 @@ int locagen_steer_watch(locagen_steer *memory, int32_t span)
 
 int locagen_steer_settle(locagen_steer *memory, int32_t span, float share)
 {
-    if (memory == NULL)
-        return LOCAGEN_E_NULL;
-    steer *s = state_of(memory);
-    locagen_span *x = span_of(s, span);
-    if (x == NULL)
-        return LOCAGEN_E_SPAN;
+    steer *s;
+    locagen_span *x;
+    int error = find_span(memory, span, &s, &x);
+    if (error != LOCAGEN_OK)
+        return error;
     if (!within((double)share, 0, 1))
         return LOCAGEN_E_SHARE;
     float *done = x->aside[1];
@@ -578,12 +581,11 @@ int locagen_steer_settle(locagen_steer *memory, int32_t span, float share)
 
 int locagen_steer_doubt(locagen_steer *memory, int32_t span)
 {
-    if (memory == NULL)
-        return LOCAGEN_E_NULL;
-    steer *s = state_of(memory);
-    locagen_span *x = span_of(s, span);
-    if (x == NULL)
-        return LOCAGEN_E_SPAN;
+    steer *s;
+    locagen_span *x;
+    int error = find_span(memory, span, &s, &x);
+    if (error != LOCAGEN_OK)
+        return error;
     for (int i = 0; i < 2; i++)
         if (x->aside_count[i] > 0) {
             memset(x->aside[i], 0, (size_t)spread_count(s) * sizeof *x->aside[i]);
@@ -592,11 +594,9 @@ int locagen_steer_doubt(locagen_steer *memory, int32_t span)
     return LOCAGEN_OK;
 }
 
-/* What the bins are worth: looks, times the weight from outside. */
-static void count_bins(const steer *s, double t)
+/* What the grid's bins are worth: looks, times the weight from outside. */
+static void count_coarse_bins(const steer *s, double t)
 {
-    for (int k = 0; k < s->bins; k++)
-        s->fine.looks[k] = (float)t * s->mask[k];
     for (int k = 0; k < s->coarse.bins; k++) {
         float sum = 0;
         for (int n = 0; n < s->coarse.thinning; n++)
@@ -621,6 +621,7 @@ static double trust(const steer *s, const locagen_spread *spread, int n, int k)
     return 1 / fmax(1, (double)(spread->rate * watched + spread->offset));
 }
 
+/* The same of all bins, in the direction of the grid that a refinement begins with. */
 static void count_fine_bins(const steer *s, const locagen_spread *spread, double t, int n)
 {
     for (int k = 0; k < s->bins; k++) {
@@ -948,10 +949,11 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
         return LOCAGEN_E_COUNT;
     if (!within((double)least, 0, (double)FLT_MAX))
         return LOCAGEN_E_LEAST;
-    steer *s = state_of(memory);
-    locagen_span *x = span_of(s, span);
-    if (x == NULL)
-        return LOCAGEN_E_SPAN;
+    steer *s;
+    locagen_span *x;
+    int error = find_span(memory, span, &s, &x);
+    if (error != LOCAGEN_OK)
+        return error;
     if (usable_mics(s, x) == 0) {
         memset(x->scores, 0, (size_t)groups_of(s) * DIRECTIONS * sizeof *x->scores);
         memset(x->over, 0, (size_t)groups_of(s) * DIRECTIONS * (size_t)s->coarse.bins * sizeof *x->over);
@@ -962,7 +964,7 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
     int count = __builtin_popcount((unsigned)how.mics), found = 0;
     aim aims[MOST_MICS];
     double score[MOST_MICS], mean_q[MOST_MICS], t = looks(s, x), first = 0, second = 0;
-    count_bins(s, t);
+    count_coarse_bins(s, t);
     for (; found < most && found < count - 1; found++, how.nulls++) {
         aim *a = &aims[found];
         s->paths->whiten(s, &how);

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import soundfile
 import torch
+from test_lab_denoise import SMALL
 
 from locagen_edge.lab.cli import main
 from locagen_edge.lab.denoise import bearings, evaluate, sounds
@@ -18,25 +19,6 @@ from locagen_edge.settings import load
 from locagen_edge.stages.denoise import MaskDenoiser
 
 KINDS = ("wave", "mask")
-SMALL = """
-[mixes]
-clip_s = 0.6
-before_s = 0.5
-pool = 8
-
-[wave]
-width = 8
-batch = 4
-steps = 6
-check = 3
-
-[mask]
-width = 8
-blocks = 1
-batch = 4
-steps = 6
-check = 3
-"""
 
 
 def lab(*arguments: object) -> int:

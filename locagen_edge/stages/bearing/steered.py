@@ -62,7 +62,7 @@ class SteeredLocator:
         steered, audio = settings.steered, settings.audio
         self._hop_s = hop_s = settings.hop_s
         self._lag = min(64, math.ceil(LAG_S / hop_s))
-        self._spans_s = (0.0, steered.span_s)
+        self.apply(settings)
         self._search = Steered(
             settings.mic_array.positions_m,
             frame=audio.frame,
@@ -94,7 +94,6 @@ class SteeredLocator:
         # A microphone that fails for a moment must not be missing from the matrix for long after; one that
         # has failed for good must not keep the others from learning.
         self._bad_hops = 0
-        self.apply(settings)
         self._know_nothing()
 
     def _know_nothing(self) -> None:
@@ -161,7 +160,9 @@ class SteeredLocator:
             # an average over a second remembers what has ended
             if span == 0 or self._onsets.going_on(towards):
                 evidence = Evidence(ratios[span], self._onsets.since_s(towards))
-                sources = found[span] if self._mask is None else self._placed(found[span], span)
+                sources = found[span]
+                if self._mask is not None and ratios[span] >= self._least_ratio:
+                    sources = self._placed(sources, span)
                 return tuple(self._told(source, span, evidence) for source in sources)
         return ()
 
@@ -211,8 +212,6 @@ class SteeredLocator:
 
         Whether something calls has been decided without the mask, which can neither make a call nor hide one.
         """
-        if self._ratios()[span] < self._least_ratio:
-            return found
         self._search.weigh(self._weights[span])
         placed = self._sources(span)
         self._search.weigh(np.ones_like(self._weights[span]))
