@@ -32,6 +32,7 @@ static const float CLOSE = 0.9f; /* the grid costs a lobe less than a tenth of i
 static const double SMEAR_HZ = 100;      /* each side: what a rotor's tones wander in some seconds at 4 kHz */
 static const double PRIOR_LOOKS = 4;     /* worth of theory against what q has been: independent values of it */
 static const double LEAST_UNBIASED = 0.25;
+static const double REACH = 5; /* standard deviations that noise hardly exceeds in one part of the band */
 static const float MOST_OVER = 10; /* q - 1 that is watched: a bang is forgotten within the usual time */
 static const double LOST = 0.1;          /* a microphone missing from more of R does not count */
 static const double SILENT = 1e-5;       /* power under the loudest one's: -50 dB */
@@ -219,6 +220,7 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
     s->grid = locagen_take(a, groups * (mics - 1) * 4 * DIRECTIONS);
     s->aim = locagen_take(a, (mics - 1) * 4 * DIRECTIONS);
     s->scores = locagen_take(a, 2 * groups * DIRECTIONS);
+    s->careful = locagen_take(a, groups * DIRECTIONS);
     s->q = locagen_take(a, (size_t)s->bins * DIRECTIONS);
     for (int n = 0; n < s->spans; n++) {
         locagen_span *span = &s->span[n];
@@ -520,13 +522,14 @@ static double prior_of(const steer *s, const locagen_span *x)
  * adds to what was watched: see locagen_spread. */
 static locagen_spread spread_of(const steer *s, locagen_span *x)
 {
-    locagen_spread spread = {.over = x->over};
+    locagen_spread spread = {.over = x->over, .seen = x->over, .careful = x->scores};
     if (x->watched <= 0 || s->learnt <= 0)
         return spread;
     double prior = prior_of(s, x), total = x->watched + prior;
     spread.spread = x->spread;
     spread.rate = (float)(1 / total);
     spread.offset = (float)(prior / total);
+    spread.reach = (float)(REACH * REACH / (looks(s, x) * averaged(s)));
     return spread;
 }
 
@@ -612,16 +615,24 @@ static long place_in_spread(const steer *s, int n)
     return (long)(n / width) * s->coarse.bins * width + n % width;
 }
 
-/* By how much the spread lessens the looks of coarse bin k in a direction of the grid. */
-static double trust(const steer *s, const locagen_spread *spread, int n, int k)
+/* By how much coarse bin k has strayed before in a direction of the grid, over theory. */
+static double wildness(const steer *s, const locagen_spread *spread, int n, int k)
 {
     if (spread->spread == NULL)
         return 1;
     float watched = spread->spread[place_in_spread(s, n) + (long)k * s->paths->width];
-    return 1 / fmax(1, (double)(spread->rate * watched + spread->offset));
+    return fmax(1, (double)(spread->rate * watched + spread->offset));
 }
 
-/* The same of all bins, in the direction of the grid that a refinement begins with. */
+/* What its looks count for where a source is to be placed that gave these q. */
+static double trust(const steer *s, const locagen_spread *spread, int n, int k)
+{
+    double wild = wildness(s, spread, n, k), reach = (double)spread->reach;
+    double over = spread->seen ? (double)spread->seen[place_in_spread(s, n) + (long)k * s->paths->width] : 0;
+    return wild > 1 ? (over * over + reach) / (over * over + wild * reach) : 1;
+}
+
+/* Looks of all bins, in the direction of the grid that a refinement begins with. */
 static void count_fine_bins(const steer *s, const locagen_spread *spread, double t, int n)
 {
     for (int k = 0; k < s->bins; k++) {
@@ -631,11 +642,10 @@ static void count_fine_bins(const steer *s, const locagen_spread *spread, double
     }
 }
 
-static void score_grid(const steer *s, enum locagen_measure measure, const locagen_spread *spread,
-                       float *scores)
+static void score_grid(const steer *s, enum locagen_measure measure, const locagen_spread *spread)
 {
     float *mean_q = s->scores + (long)groups_of(s) * DIRECTIONS; /* nobody reads it */
-    s->paths->score(s, &s->coarse, measure, spread, s->grid, groups_of(s), scores, mean_q);
+    s->paths->score(s, &s->coarse, measure, spread, s->grid, groups_of(s), s->scores, mean_q);
 }
 
 /* Whether the lobe of one direction may hold the other. */
@@ -664,6 +674,7 @@ static int next_on_grid(const steer *s, const float *scores, const int *before, 
 typedef struct {
     int at;              /* on the grid, where the refinement began */
     double u[3], score, mean_q;
+    double careful;      /* score */
     double along[2][3];  /* the coordinates' axes */
     double hessian[3];   /* xx, xy, yy */
 } aim;
@@ -764,27 +775,29 @@ static void refine(const steer *s, enum locagen_measure measure, aim *a)
 }
 
 /* The best direction of all. The grid may put lobes in a wrong order that differ by less than it loses
- * beside a lobe's top: then several are refined. Returns 0 where nothing scores more than `least`. `t`:
- * looks. */
+ * beside a lobe's top: then several are refined. Returns 0 where nothing scores more than `least`, carefully.
+ * `t`: looks. */
 static int find_best(const steer *s, enum locagen_measure measure, const locagen_spread *spread, double t,
-                     float least, float *scores, aim *best)
+                     float least, aim *best)
 {
+    const float *scores = s->scores, *careful = spread->careful ? spread->careful : scores;
     int top[MOST_LOBES], lobes = 0;
-    score_grid(s, measure, spread, scores);
+    score_grid(s, measure, spread);
     for (; lobes < MOST_LOBES; lobes++) {
         top[lobes] = next_on_grid(s, scores, top, lobes);
         if (top[lobes] < 0 || !(scores[top[lobes]] > CLOSE * scores[top[0]]))
             break;
-        if (!(scores[top[0]] > CLOSE * least))
+        if (!(careful[top[0]] > CLOSE * least))
             return 0;
         aim a = {.at = top[lobes]};
         memcpy(a.u, s->grid_u + 3 * top[lobes], sizeof a.u);
         count_fine_bins(s, spread, t, a.at);
         refine(s, measure, &a);
+        a.careful = a.score * (double)(careful[a.at] / scores[a.at]);
         if (lobes == 0 || a.score > best->score)
             *best = a;
     }
-    return lobes > 0 && best->score > (double)least;
+    return lobes > 0 && best->careful > (double)least;
 }
 
 /* 1 / E q of noise, whitened by a matrix from N looks at it: of such an adaptive beam the output power over
@@ -808,8 +821,9 @@ static int is_top(const steer *s, const float *scores, int n)
 }
 
 /* Score of the best top elsewhere, over that of the best. */
-static double rival(const steer *s, const locagen_spread *spread, double t, const float *scores, const aim *best)
+static double rival(const steer *s, const locagen_spread *spread, double t, const aim *best)
 {
+    const float *scores = s->scores;
     int at = -1;
     for (int n = 0; n < s->azimuths * s->elevations; n++)
         if ((at < 0 || scores[n] > scores[at]) && is_top(s, scores, n) &&
@@ -850,7 +864,7 @@ static locagen_whitening whitening(steer *s, const locagen_span *x)
     for (int k = 0; k < s->bins; k++)
         total += (double)s->fine.planes[k];
     aim a;
-    double along = find_best(s, MEASURE_POWER, &PLAIN, 1, 0, s->scores, &a) ? a.score : 0;
+    double along = find_best(s, MEASURE_POWER, &PLAIN, 1, 0, &a) ? a.score : 0;
     double across = (total - along) / (s->bins * ((double)count - 1));
     how.white = (float)fmax(fmax(across, WHITE_SHARE * total / s->bins), (double)s->floor);
     s->paths->invert(s, &how);
@@ -873,7 +887,7 @@ static double contrast(const steer *s, const locagen_spread *spread, int n, int 
         for (int i = first; i <= last; i++)
             p += (double)power[i];
         p = fmax(0, p / (r->thinning * (last - first + 1.0)) - 1);
-        sum += (double)r->looks[k] * trust(s, spread, n, k) * (q - log1p(q) - mics * (p - log1p(p)));
+        sum += (double)r->looks[k] / wildness(s, spread, n, k) * (q - log1p(q) - mics * (p - log1p(p)));
     }
     return sum;
 }
@@ -968,14 +982,14 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
     for (; found < most && found < count - 1; found++, how.nulls++) {
         aim *a = &aims[found];
         s->paths->whiten(s, &how);
-        if (!find_best(s, MEASURE_RATIO, &spread, t, least, found == 0 ? x->scores : s->scores, a))
+        if (!find_best(s, MEASURE_RATIO, &spread, t, least, a))
             break;
-        score[found] = a->score, mean_q[found] = a->mean_q;
+        score[found] = a->careful, mean_q[found] = a->mean_q;
         if (found == 0) {
             first = contrast(s, &spread, a->at, count);
-            second = rival(s, &spread, t, x->scores, a);
+            second = rival(s, &spread, t, a);
         }
-        spread.over = NULL; /* with nulls they would not be those of the noise */
+        spread.over = NULL, spread.careful = s->careful; /* with nulls they are not those of the noise */
         add_null(s, found, a->u);
         s->fine.least = s->coarse.least = LEAST_AFTER_NULL * (float)count;
     }
