@@ -23,7 +23,8 @@ static const double PI = 3.14159265358979323846;
 static const double THIN_PHASE = 0.15;
 
 /* Half widths of the parabola through the scores, as phase across the array at the band's upper end: wide
- * where the grid's own step is to be bridged, at last as narrow as float's rounding of the scores allows. */
+ * where the grid's own step is to be bridged, and kept where that is not enough, along a low voice's ridge; at
+ * last as narrow as float's rounding of the scores allows. */
 static const double WIDTHS[] = {0.6, 0.4, 0.2, 0.2};
 
 static const double LOBE = 3.0;  /* radians of phase from a lobe's top to beyond its foot */
@@ -32,7 +33,6 @@ static const float CLOSE = 0.9f; /* the grid costs a lobe less than a tenth of i
 static const double SMEAR_HZ = 100;      /* each side: what a rotor's tones wander in some seconds at 4 kHz */
 static const double PRIOR_LOOKS = 4;     /* worth of theory against what q has been: independent values of it */
 static const double LEAST_UNBIASED = 0.25;
-static const double REACH = 5; /* standard deviations that noise hardly exceeds in one part of the band */
 static const float MOST_OVER = 10; /* q - 1 that is watched: a bang is forgotten within the usual time */
 static const double LOST = 0.1;          /* a microphone missing from more of R does not count */
 static const double SILENT = 1e-5;       /* power under the loudest one's: -50 dB */
@@ -44,7 +44,7 @@ static const double WATCH_SHARE = 1.0 / 300; /* the usual share of one hop in th
 
 static const locagen_spread PLAIN; /* as theory says */
 
-enum { MOST_THINNING = 8, LEAST_COARSE = 8, MOST_LOBES = 4 };
+enum { MOST_THINNING = 8, LEAST_COARSE = 8, MOST_LOBES = 4, MOST_STEPS = 12 };
 
 static steer *state_of(const void *memory)
 {
@@ -529,7 +529,7 @@ static locagen_spread spread_of(const steer *s, locagen_span *x)
     spread.spread = x->spread;
     spread.rate = (float)(1 / total);
     spread.offset = (float)(prior / total);
-    spread.reach = (float)(REACH * REACH / (looks(s, x) * averaged(s)));
+    spread.theory = (float)(1 / (looks(s, x) * averaged(s)));
     return spread;
 }
 
@@ -627,9 +627,9 @@ static double wildness(const steer *s, const locagen_spread *spread, int n, int 
 /* What its looks count for where a source is to be placed that gave these q. */
 static double trust(const steer *s, const locagen_spread *spread, int n, int k)
 {
-    double wild = wildness(s, spread, n, k), reach = (double)spread->reach;
+    double wild = wildness(s, spread, n, k), theory = (double)spread->theory, reach = REACH * REACH * theory;
     double over = spread->seen ? (double)spread->seen[place_in_spread(s, n) + (long)k * s->paths->width] : 0;
-    return wild > 1 ? (over * over + reach) / (over * over + wild * reach) : 1;
+    return wild > 1 ? (over * over + reach) / (over * over * (1 + (wild - 1) * theory) + wild * reach) : 1;
 }
 
 /* Looks of all bins, in the direction of the grid that a refinement begins with. */
@@ -699,9 +699,10 @@ static void moved(const steer *s, const aim *a, double x, double y, double to[3]
         normalise(to);
 }
 
-/* The best step on the parabola, no longer than `most`. A direction that the score does not depend on (an
- * array in a line) and one that it curves upwards in are followed uphill only a little. */
-static void newton(const double g[2], const double h[3], double most, double step[2])
+/* The best step on the parabola, no longer than `most`; returns whether it would have been. A direction that the
+ * score does not depend on (an array in a line) and one that it curves upwards in are followed uphill only a
+ * little. */
+static int newton(const double g[2], const double h[3], double most, double step[2])
 {
     double middle = -(h[0] + h[2]) / 2, apart = hypot((h[0] - h[2]) / 2, h[1]);
     double largest = fabs(middle) + apart, least = 1e-3 * largest + 1e-30;
@@ -713,10 +714,12 @@ static void newton(const double g[2], const double h[3], double most, double ste
     double length = hypot(step[0], step[1]);
     if (length > most)
         step[0] *= most / length, step[1] *= most / length;
+    return length > most;
 }
 
-/* One Newton step from scores at the corners of a hexagon of half width h and its middle. */
-static void refine_once(const steer *s, enum locagen_measure measure, double h, aim *a)
+/* One Newton step from scores at the corners of a hexagon of half width h and its middle. Returns whether the
+ * top is farther away. */
+static int refine_once(const steer *s, enum locagen_measure measure, double h, aim *a)
 {
     static const double AT[DIRECTIONS][2] = {
         {0, 0}, {1, 0}, {-1, 0}, {0, 1}, {0, -1}, {1, 1}, {-1, -1}, {0, 0},
@@ -740,7 +743,7 @@ static void refine_once(const steer *s, enum locagen_measure measure, double h, 
     a->hessian[2] = (f[3] + f[4] - 2 * f[0]) / (h * h);
     a->hessian[1] = (f[5] + f[6] - f[1] - f[2] - f[3] - f[4] + 2 * f[0]) / (2 * h * h);
     const double *m = a->hessian;
-    newton(g, m, 2 * h, step);
+    int farther = newton(g, m, 2 * h, step);
     if (s->flat) {
         double v[2] = {dot(a->u, s->axes[0]), dot(a->u, s->axes[1])};
         double r = hypot(v[0] + step[0], v[1] + step[1]);
@@ -766,12 +769,14 @@ static void refine_once(const steer *s, enum locagen_measure measure, double h, 
                   0.5 * (m[0] * step[0] * step[0] + 2 * m[1] * step[0] * step[1] + m[2] * step[1] * step[1]);
     a->score = f[0] + fmax(gain, -0.5 * fabs(f[0]));
     a->mean_q = (double)mean_q[0];
+    return farther;
 }
 
 static void refine(const steer *s, enum locagen_measure measure, aim *a)
 {
-    for (size_t n = 0; n < sizeof WIDTHS / sizeof *WIDTHS; n++)
-        refine_once(s, measure, WIDTHS[n] / s->reach, a);
+    int left = MOST_STEPS;
+    for (size_t n = 0; n < sizeof WIDTHS / sizeof *WIDTHS && left > 0; left--)
+        n += !refine_once(s, measure, WIDTHS[n] / s->reach, a);
 }
 
 /* The best direction of all. The grid may put lobes in a wrong order that differ by less than it loses

@@ -11,6 +11,7 @@
 enum {
     MOST_MICS = 8,
     MOST_SPANS = 4,
+    REACH = 5,      /* standard deviations that noise hardly exceeds in one part of the band */
     MOST_LAG = 64,
     DIRECTIONS = 8, /* directions scored side by side, in one vector or two */
     BIN_BLOCK = 16  /* planes are padded to whole cache lines */
@@ -95,13 +96,14 @@ enum locagen_measure { MEASURE_RATIO, MEASURE_POWER }; /* sum of g(q), or of q *
 
 /* Beside the scores of the grid: its q, and by how much each has spread before, over theory:
  * wild = max(1, rate * spread + offset). A careful score divides looks by it: whether there is a source. Where it
- * is, the score tells with all looks of what is far beyond the noise's reach. */
+ * is, the score tells with nearly all looks of what is far beyond the noise's reach, less what noise takes
+ * that is louder than R_n: as it was before, on average by theory * (wild - 1). */
 typedef struct {
     float *over, *careful;      /* where to put q - 1 and careful scores; null: nowhere */
     const float *seen;          /* q - 1 of the grid before any null */
     const float *spread;        /* null: as theory says */
     float rate, offset;
-    float reach;                /* (q - 1)^2 up to which it may be noise, were it as theory says */
+    float theory;               /* mean (q - 1)^2 of noise as theory has it */
 } locagen_spread;
 
 typedef struct locagen_steer_paths {

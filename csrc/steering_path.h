@@ -90,6 +90,7 @@ STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const 
                  long at, const float *q, float *score, float *mean_q)
 {
     const vec one = all(1.0f), most = all(1e9f); /* 90 dB: its square is finite */
+    const vec reach = all(REACH * REACH * spread->theory);
     long bins = r->bins, half = r->half;
     vec plain = all(0.0f), sum = all(0.0f), careful = all(0.0f), window = all(0.0f);
     for (long k = 0; k < half; k++)
@@ -109,7 +110,8 @@ STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const 
         if (spread->spread) {
             vec wild = larger(spread->rate * load(spread->spread + at + k * WIDTH) + spread->offset, one);
             careful += gain / wild;
-            gain *= (over * over + spread->reach) / (over * over + wild * spread->reach);
+            vec x = over * over, louder = one + (wild - one) * spread->theory;
+            gain *= (x + reach) / (x * louder + wild * reach);
         }
         sum += gain;
     }
