@@ -655,12 +655,23 @@ static int same_lobe(const steer *s, const double u[3], const double v[3])
     return s->reach * sqrt(fmax(0, dot(d, d) - across * across)) < LOBE;
 }
 
-/* The best direction of the grid outside the lobes of those before it. */
+/* Whether a direction of the grid is no lower than those beside it: each row is a circle, rows end. */
+static int is_top(const steer *s, const float *scores, int n)
+{
+    int row = n / s->azimuths, column = n % s->azimuths;
+    int left = row * s->azimuths + (column + s->azimuths - 1) % s->azimuths;
+    int right = row * s->azimuths + (column + 1) % s->azimuths;
+    return scores[n] >= scores[left] && scores[n] >= scores[right] &&
+           (row == 0 || scores[n] >= scores[n - s->azimuths]) &&
+           (row == s->elevations - 1 || scores[n] >= scores[n + s->azimuths]);
+}
+
+/* The best top of the grid outside the lobes of those before it; a low voice's are wide, and their flanks high. */
 static int next_on_grid(const steer *s, const float *scores, const int *before, int count_before)
 {
     int best = -1;
     for (int n = 0; n < s->azimuths * s->elevations; n++) {
-        if (best >= 0 && !(scores[n] > scores[best]))
+        if ((best >= 0 && !(scores[n] > scores[best])) || !is_top(s, scores, n))
             continue;
         int apart = 1;
         for (int i = 0; i < count_before && apart; i++)
@@ -675,6 +686,7 @@ typedef struct {
     int at;              /* on the grid, where the refinement began */
     double u[3], score, mean_q;
     double careful;      /* score */
+    double rival;        /* score in the best other lobe, over this */
     double along[2][3];  /* the coordinates' axes */
     double hessian[3];   /* xx, xy, yy */
 } aim;
@@ -779,29 +791,38 @@ static void refine(const steer *s, enum locagen_measure measure, aim *a)
         n += !refine_once(s, measure, WIDTHS[n] / s->reach, a);
 }
 
-/* The best direction of all. The grid may put lobes in a wrong order that differ by less than it loses
- * beside a lobe's top: then several are refined. Returns 0 where nothing scores more than `least`, carefully.
- * `t`: looks. */
+/* The best direction of all, and what the best in another lobe scores over it. The grid may put lobes in a wrong
+ * order that differ by less than it loses beside a lobe's top: then several are refined. Returns 0 where nothing
+ * scores more than `least`, carefully. `t`: looks. */
 static int find_best(const steer *s, enum locagen_measure measure, const locagen_spread *spread, double t,
                      float least, aim *best)
 {
     const float *scores = s->scores, *careful = spread->careful ? spread->careful : scores;
     int top[MOST_LOBES], lobes = 0;
+    double second = 0;
     score_grid(s, measure, spread);
     for (; lobes < MOST_LOBES; lobes++) {
-        top[lobes] = next_on_grid(s, scores, top, lobes);
-        if (top[lobes] < 0 || !(scores[top[lobes]] > CLOSE * scores[top[0]]))
+        int at = top[lobes] = next_on_grid(s, scores, top, lobes);
+        if (at < 0 || !(scores[at] > 0))
             break;
-        if (!(careful[top[0]] > CLOSE * least))
+        if (lobes == 0 && !(careful[at] > CLOSE * least))
             return 0;
-        aim a = {.at = top[lobes]};
-        memcpy(a.u, s->grid_u + 3 * top[lobes], sizeof a.u);
-        count_fine_bins(s, spread, t, a.at);
+        if (!(scores[at] > CLOSE * CLOSE * scores[top[0]])) {
+            second = fmax(second, (double)scores[at]);
+            break;
+        }
+        aim a = {.at = at};
+        memcpy(a.u, s->grid_u + 3 * at, sizeof a.u);
+        count_fine_bins(s, spread, t, at);
         refine(s, measure, &a);
-        a.careful = a.score * (double)(careful[a.at] / scores[a.at]);
-        if (lobes == 0 || a.score > best->score)
+        a.careful = a.score * (double)(careful[at] / scores[at]);
+        int better = lobes == 0 || a.score > best->score;
+        if (lobes > 0 && !same_lobe(s, a.u, best->u))
+            second = fmax(second, better ? best->score : a.score);
+        if (better)
             *best = a;
     }
+    best->rival = lobes > 0 ? second / best->score : 0;
     return lobes > 0 && best->careful > (double)least;
 }
 
@@ -812,39 +833,6 @@ static double unbiased(const steer *s, int mics)
 {
     double n = looks_of(s, s->learnt, s->learnt_variance);
     return fmax(LEAST_UNBIASED, (n - mics + 1) * (n - mics) / (n * n));
-}
-
-/* Whether a direction of the grid is no lower than those beside it: each row is a circle, rows end. */
-static int is_top(const steer *s, const float *scores, int n)
-{
-    int row = n / s->azimuths, column = n % s->azimuths;
-    int left = row * s->azimuths + (column + s->azimuths - 1) % s->azimuths;
-    int right = row * s->azimuths + (column + 1) % s->azimuths;
-    return scores[n] >= scores[left] && scores[n] >= scores[right] &&
-           (row == 0 || scores[n] >= scores[n - s->azimuths]) &&
-           (row == s->elevations - 1 || scores[n] >= scores[n + s->azimuths]);
-}
-
-/* Score of the best top elsewhere, over that of the best. */
-static double rival(const steer *s, const locagen_spread *spread, double t, const aim *best)
-{
-    const float *scores = s->scores;
-    int at = -1;
-    for (int n = 0; n < s->azimuths * s->elevations; n++)
-        if ((at < 0 || scores[n] > scores[at]) && is_top(s, scores, n) &&
-            !same_lobe(s, s->grid_u + 3 * n, best->u))
-            at = n;
-    if (at < 0)
-        return 0;
-    aim a = {.at = at, .score = (double)scores[at]};
-    if (scores[at] > CLOSE * CLOSE * scores[best->at]) {
-        memcpy(a.u, s->grid_u + 3 * at, sizeof a.u);
-        count_fine_bins(s, spread, t, at);
-        refine(s, MEASURE_RATIO, &a);
-        if (same_lobe(s, a.u, best->u))
-            return 0;
-    }
-    return a.score / best->score;
 }
 
 /* How R_n is to be had; where it was never learnt, its level from the power across the direction of most
@@ -982,7 +970,7 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
     locagen_spread spread = spread_of(s, x);
     int count = __builtin_popcount((unsigned)how.mics), found = 0;
     aim aims[MOST_MICS];
-    double score[MOST_MICS], mean_q[MOST_MICS], t = looks(s, x), first = 0, second = 0;
+    double score[MOST_MICS], mean_q[MOST_MICS], t = looks(s, x), first = 0;
     count_coarse_bins(s, t);
     for (; found < most && found < count - 1; found++, how.nulls++) {
         aim *a = &aims[found];
@@ -990,10 +978,8 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
         if (!find_best(s, MEASURE_RATIO, &spread, t, least, a))
             break;
         score[found] = a->careful, mean_q[found] = a->mean_q;
-        if (found == 0) {
+        if (found == 0)
             first = contrast(s, &spread, a->at, count);
-            second = rival(s, &spread, t, a);
-        }
         spread.over = NULL, spread.careful = s->careful; /* with nulls they are not those of the noise */
         add_null(s, found, a->u);
         s->fine.least = s->coarse.least = LEAST_AFTER_NULL * (float)count;
@@ -1007,7 +993,7 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
         aims[n].score = score[n], aims[n].mean_q = mean_q[n];
         out[n] = told(&aims[n], how.mics);
         out[n].contrast = (float)first;
-        out[n].rival = n == 0 ? (float)second : 0.0f;
+        out[n].rival = n == 0 ? (float)aims[0].rival : 0.0f;
     }
     return found;
 }

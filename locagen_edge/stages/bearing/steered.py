@@ -34,7 +34,7 @@ learnt from fewer is nearly singular, and whitening by it invents sources."""
 
 LAG_S = 0.5
 """Noise is learnt so late: by then a call is known as one, and its beginning is not learnt."""
-MEANING = 1.6
+MEANING = 1.3
 """Evidence from which a direction means something, though not yet a call."""
 WATCH_S = 15.0
 LOUDER = -0.5
@@ -47,7 +47,7 @@ FLAT = 0.93
 """Least score over the best from which all directions are alike: noise far louder than what was learnt."""
 SILENCE = 1e-11
 """-110 dBFS mean square in the band: a muted input teaches nothing."""
-RIVAL = 0.9
+RIVAL = 0.95
 """Score of another lobe over the best from which nobody knows which is true: 0.96 and more for a whistle of
 3 kHz, whose wavelength is shorter than twice the array; under 0.7 for voices."""
 SECOND = 0.2
