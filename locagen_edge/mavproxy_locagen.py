@@ -50,6 +50,7 @@ class Event:
     confidence: float = math.nan
     place: Point | None = None
     confirmed: bool = False
+    ambiguous: bool = False
 
 
 def beyond(here: Point, azimuth_rad: float, distance_m: float) -> Point:
@@ -126,6 +127,7 @@ class Locagen(mp_module.MPModule):  # type: ignore[misc]
         event.azimuth_deg, event.sigma_deg = record.azimuth_true, record.azimuth_sigma
         event.confidence = record.confidence
         event.confirmed |= bool(record.flags & dialect.messages.LOCAGEN_BEARING_FLAGS_CONFIRMED)
+        event.ambiguous = bool(record.flags & dialect.messages.LOCAGEN_BEARING_FLAGS_AMBIGUOUS)
         if UNKNOWN in (record.lat, record.lon) or not math.isfinite(record.azimuth_true):
             return
         here = (record.lat * 1e-7, record.lon * 1e-7)
@@ -177,6 +179,8 @@ class Locagen(mp_module.MPModule):  # type: ignore[misc]
             where = f"{event.azimuth_deg:03.0f} deg true +-{event.sigma_deg:.0f}"
             if not math.isfinite(event.azimuth_deg):
                 where = "no true bearing"
+            if event.ambiguous:
+                where += " or its mirror image"
             place = f", at {event.place[0]:.6f} {event.place[1]:.6f}" if event.place else ""
             sure = " confirmed" if event.confirmed else ""
             since = f"over {event.last_s - event.began_s:.0f} s, {now_s - event.last_s:.0f} s ago"

@@ -120,7 +120,7 @@ def test_each_bearing_has_the_pose_of_its_moment_and_points_at_the_caller(flown)
 
 def test_the_operator_reads_how_far_it_is_once(flown):
     texts = [m.text for m in flown.said if m.get_type() == "STATUSTEXT"]
-    placed = [t for t in texts if re.fullmatch(r"Call heard: \d{3} deg true, \d+ m \+-\d+ m", t)]
+    placed = [t for t in texts if re.fullmatch(r"Call heard: \d{3} deg true, \d+ m \+-\d+ m, conf \d\.\d", t)]
     assert len(placed) == 1
     distance_m = int(re.search(r"(\d+) m \+", placed[0])[1])
     assert 20 < distance_m < 55

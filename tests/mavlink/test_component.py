@@ -473,9 +473,9 @@ def test_a_call_without_a_place_is_told_again_once_it_has_one() -> None:
     component = Component(MavlinkSettings())
     first = texts(said(component, replace(PLACED, positions=()), 3))
     assert first == ["Call heard: 012 deg true, 042 from nose, +-4 deg"]
-    assert texts(said(component, PLACED, 10, 3.0)) == ["Call heard: 012 deg true, 50 m +-8 m"]
+    assert texts(said(component, PLACED, 10, 3.0)) == ["Call heard: 012 deg true, 50 m +-8 m, conf 0.9"]
     component.say_again()
-    assert texts(said(component, PLACED, 10, 13.0)) == ["Call heard: 012 deg true, 50 m +-8 m"]
+    assert texts(said(component, PLACED, 10, 13.0)) == ["Call heard: 012 deg true, 50 m +-8 m, conf 0.9"]
 
 
 def test_no_place_is_told_where_the_range_is_not_observable() -> None:
@@ -503,6 +503,13 @@ def test_the_records_say_what_is_known() -> None:
         | flags.LOCAGEN_POSITION_FLAGS_ON_GROUND
         | flags.LOCAGEN_POSITION_FLAGS_CONFIRMED
     )
+
+
+@pytest.mark.parametrize("two", [True, False])
+def test_what_may_as_well_be_mirrored_is_marked(two: bool) -> None:
+    messages = said(Component(MavlinkSettings()), replace(PLACED, ambiguous=two), 1)
+    flags = [m.flags for m in messages if m.get_type() == "LOCAGEN_BEARING"]
+    assert {bool(f & dialect.messages.LOCAGEN_BEARING_FLAGS_AMBIGUOUS) for f in flags} == {two}
 
 
 def test_every_confirmed_caller_has_a_record_and_values_are_of_the_best() -> None:

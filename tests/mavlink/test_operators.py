@@ -41,7 +41,7 @@ async def calls(settings: Settings) -> AsyncIterator[Frame]:
 
 @asynccontextmanager
 async def daemon_at(port: int, state: Path) -> AsyncIterator[Daemon]:
-    mavlink = {"link": f"udpout:127.0.0.1:{port}", "signing_state": str(state)}
+    mavlink = {"link": f"udpout:127.0.0.1:{port}", "state_directory": str(state)}
     settings = from_table({"mavlink": mavlink, "bearing": {"estimator": "far-field"}})
     async with running(settings, sources=calls) as daemon:
         yield daemon
