@@ -1,7 +1,7 @@
 """What befalls links and clocks in flight: the daemon hears on, and its log lacks no bearing.
 
-How fast a link is back follows from `links.BACKOFF_S` (`test_links.py`); what a flood may cost, from the bytes
-and changes that are let in (`test_link.py`, `test_commands.py`).
+How fast a link is back follows from `links.BACKOFF_S` (`test_links.py`); what a flood may cost, from the
+bytes and changes that are let in (`test_link.py`, `test_commands.py`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import pytest
 from pymavlink.dialects.v20 import common
 from test_daemon import running, steady, until
 from test_link import Server, Uart, free_port, udp
-from test_twins import TAKEN
+from test_twins import TAKEN, Other
 
 from locagen_edge.daemon import Daemon
 from locagen_edge.mavlink import dialect
@@ -78,7 +78,8 @@ async def flying(link: str, folder: Path, **mavlink: Any) -> AsyncIterator[Daemo
         assert daemon.black_box is not None
     kept = [r for r in records(folder / "log") if r["type"] == "bearing"]
     assert daemon.black_box.lost == 0
-    assert [r["start"] for r in kept] == estimated, "no bearing is lost from the log"
+    heard = [r["start"] for r in kept if r["detection"]["call"] or r["tracks"]]
+    assert heard == estimated, "no bearing is lost from the log"
     times = [r["t_ns"] for r in kept]
     assert times == sorted(times)
 
@@ -201,20 +202,21 @@ def test_a_flood_of_2000_messages_a_second(tmp_path: Path) -> None:
     asyncio.run(test())
 
 
-def test_the_wall_clock_that_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_wall_clock_that_steps(tmp_path: Path) -> None:
     """A computer without a clock learns the date in flight; another one is set back by a day."""
     (tmp_path / "key").write_text("a passphrase")
     (tmp_path / "key").chmod(0o600)
     now, now_ns = time.time, time.time_ns
 
     async def test() -> None:
-        with closing(udp()) as peer:
+        with closing(udp()) as peer, pytest.MonkeyPatch.context() as patch:
             link = f"udpout:127.0.0.1:{peer.getsockname()[1]}"
-            async with flying(link, tmp_path, signing_key=str(tmp_path / "key")) as daemon:
+            key = str(tmp_path / "key")
+            async with flying(link, tmp_path, signing_key=key) as daemon:
                 stamps = []
                 for step_s in (0.0, -86_400.0, 40_000_000.0, -3600.0):
-                    monkeypatch.setattr(time, "time", lambda step_s=step_s: now() + step_s)
-                    monkeypatch.setattr(time, "time_ns", lambda step_s=step_s: now_ns() + round(step_s * 1e9))
+                    patch.setattr(time, "time", lambda step_s=step_s: now() + step_s)
+                    patch.setattr(time, "time_ns", lambda step_s=step_s: now_ns() + round(step_s * 1e9))
                     then = daemon.component.sent["LOCAGEN_BEARING"]
                     await until(lambda: daemon.component.sent["LOCAGEN_BEARING"] > then + 1)  # noqa: B023
                     found = [p for p in Framer().feed(read(peer)) if p.signed]
@@ -234,14 +236,14 @@ def test_another_component_under_our_ids_is_told_once_and_bearings_go_on(
             async with flying(f"udpout:127.0.0.1:{peer.getsockname()[1]}", tmp_path) as daemon:
                 await until(lambda: daemon.links.up)
                 ours = daemon.links.links[0]._port.transport.get_extra_info("sockname")
-                beat = common.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+                other = Other(begins=100)
                 for _ in range(5):
-                    peer.sendto(packed(beat, 1, 191), ours)
+                    peer.sendto(other.heartbeat(), ours)
                 await until(lambda: TAKEN in daemon._in_words())
                 then = daemon.component.sent["LG_AZB"]
                 await until(lambda: daemon.component.sent["LG_AZB"] > then + 1)
                 for _ in range(5):
-                    peer.sendto(packed(beat, 1, 191), ours)
+                    peer.sendto(other.heartbeat(), ours)
                 await until(lambda: daemon.component.sent["HEARTBEAT"] > 2)
                 texts = [
                     m.text

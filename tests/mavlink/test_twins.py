@@ -23,8 +23,9 @@ TAKEN = "Ids 1/191 are taken: set mavlink.component_id"
 class Other:
     """A component under our ids, with what it sends."""
 
-    def __init__(self) -> None:
+    def __init__(self, begins: int = 0) -> None:
         self._mav = common.MAVLink(None, 1, 191)
+        self._mav.seq = begins
 
     def says(self, message: Any) -> bytes:
         frame = bytes(message.pack(self._mav))
