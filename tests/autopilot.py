@@ -14,18 +14,24 @@ speed. What it is for is what lies between a companion's link and a ground stati
 - signing by pymavlink's own implementation: with a key unsigned frames are refused without a word, but on the
   first link (ArduPilot's USB port), on which SETUP_SIGNING may come;
 - TIMESYNC, parameters, and what it takes to fly: mode, arming, take-off, reposition.
+
+`python tests/autopilot.py 5760 5762` runs it by itself, in the place of a simulator.
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
+import os
+import sys
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 from pymavlink.dialects.v20 import ardupilotmega as ardupilot
 
 from locagen_edge.geodesy import moved, north_east_down_m
@@ -254,12 +260,12 @@ _HEARD: dict[str, Callable[[Autopilot, Channel, Any], None]] = {
 
 
 @asynccontextmanager
-async def autopilot(links: int = 2) -> AsyncIterator[Autopilot]:
-    """At work on as many TCP ports; `channels[n].port` says which."""
-    pilot = Autopilot(links)
+async def autopilot(*ports: int) -> AsyncIterator[Autopilot]:
+    """At work on these TCP ports, or two others; `channels[n].port` says which."""
+    pilot = Autopilot(len(ports) or 2)
     servers = []
-    for channel in pilot.channels:
-        server = await asyncio.start_server(channel.serve, "127.0.0.1", 0)
+    for channel, port in zip(pilot.channels, ports or (0, 0), strict=True):
+        server = await asyncio.start_server(channel.serve, "127.0.0.1", port)
         channel.port = server.sockets[0].getsockname()[1]
         servers.append(server)
     task = asyncio.create_task(pilot.run())
@@ -274,3 +280,53 @@ async def autopilot(links: int = 2) -> AsyncIterator[Autopilot]:
             if channel.writer is not None:
                 channel.writer.transport.abort()
         await asyncio.sleep(0.02)
+
+
+# --- it, or a simulator -----------------------------------------------------------------------------------
+
+SITL = os.environ.get("LOCAGEN_SITL", "")
+"""ArduPilot's simulator: `tcp:127.0.0.1:5760` is the ground station's link to it, the companion's is two
+ports on (its SERIAL1) unless a second is named behind a comma"""
+PILOTS = [
+    "stand-in",
+    pytest.param(
+        "simulator",
+        marks=pytest.mark.skipif(
+            not SITL, reason="no simulator: LOCAGEN_SITL=tcp:127.0.0.1:5760 names one (ArduCopter)"
+        ),
+    ),
+]
+"""for tests through an autopilot: against the stand-in, and, where one is named, a simulator"""
+
+
+@dataclass
+class Ends:
+    """Where an autopilot can be met."""
+
+    kind: str
+    companion: str
+    ground: tuple[str, int]
+    pilot: Autopilot | None = None
+
+
+@asynccontextmanager
+async def met(kind: str) -> AsyncIterator[Ends]:
+    """One of `PILOTS`, at work."""
+    if kind == "simulator":
+        first, _, second = SITL.partition(",")
+        scheme, host, port = first.split(":")
+        assert scheme == "tcp", "LOCAGEN_SITL: tcp:HOST:PORT, or two of them with a comma between"
+        yield Ends(kind, second or f"tcp:{host}:{int(port) + 2}", (host, int(port)))
+        return
+    async with autopilot() as pilot:
+        ground, companion = pilot.channels
+        yield Ends(kind, f"tcp:127.0.0.1:{companion.port}", ("127.0.0.1", ground.port), pilot)
+
+
+async def main(*ports: int) -> None:
+    async with autopilot(*ports):
+        await asyncio.Event().wait()
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*map(int, sys.argv[1:])))

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from autopilot import PILOTS, met
 from conftest import ROOT
 from peers import WITHIN_S, free_port, null_modem, operator
 from test_daemon import running, steady, until
@@ -39,15 +40,20 @@ async def calls(settings: Settings) -> AsyncIterator[Frame]:
         await asyncio.sleep(0.03)
 
 
-LINKS = ["udp", "tcp", "serial"]
+LINKS = ["udp", "tcp", "serial", *PILOTS]
 
 
 @asynccontextmanager
 async def road(kind: str) -> AsyncIterator[tuple[str, str, str]]:
-    """A link of that kind as we name it, as MAVSDK does and as MAVProxy does."""
+    """A link of that kind, or through an autopilot, as we name it, as MAVSDK does and as MAVProxy does."""
     if kind == "serial":
         async with null_modem() as (near, far):
             yield f"serial:{near}:57600", f"serial://{far}:57600", far
+        return
+    if kind in ("stand-in", "simulator"):
+        async with met(kind) as ends:
+            at = "{}:{}".format(*ends.ground)
+            yield ends.companion, f"tcpout://{at}", f"tcp:{at}"
         return
     at = f"127.0.0.1:{free_port(socket.SOCK_DGRAM if kind == 'udp' else socket.SOCK_STREAM)}"
     yield {
