@@ -84,6 +84,7 @@ class Channel:
 
     def say(self, message: Any) -> None:
         self.write(bytes(message.pack(self.mav)))
+        self.mav.seq = (self.mav.seq + 1) % 256
 
     def set_key(self, key: bytes | None) -> None:
         signing = self.mav.signing
