@@ -210,8 +210,8 @@ class Callers:
 
     def _placed(self, track: Track, estimate: Estimate, utc_ns: int) -> Told | None:
         position = estimate.position(track)
-        if position is None:
-            return None
+        if position is None or (track.silent_s > 0.0 and track.id in self._events):
+            return None  # nothing new; what is sure of a call fades while nothing is heard
         heard_ns = utc_ns + position.t_ns - estimate.t_ns - round(position.age_s * 1e9)
         return event(position, heard_ns, name=f"caller {track.id}", confidence=track.confidence)
 
@@ -350,7 +350,7 @@ def geojson(events: Sequence[Told]) -> str:
 
 
 def _known(e: Told) -> dict[str, Any]:
-    told = {"name": e.name, "kind": e.kind, "time_utc": e.time_utc, "confidence": e.confidence}
+    told = {"name": e.name, "kind": e.kind, "time_utc": e.time_utc, "confidence": _two(e.confidence)}
     if isinstance(e, Direction):
         return told | {
             "azimuth_true_deg": round(compass_deg(e.azimuth_rad), 1),
@@ -361,6 +361,10 @@ def _known(e: Told) -> dict[str, Any]:
         "semi_minor_m": round(e.semi_minor_m, 2),
         "orientation_deg": round(math.degrees(e.orientation_rad) % 180.0, 1),
     }
+
+
+def _two(value: float | None) -> float | None:
+    return None if value is None else round(value, 2)
 
 
 def _shape(kind: str, parts: list[Any], properties: dict[str, Any]) -> dict[str, Any]:

@@ -641,7 +641,7 @@ class LogSettings:
         unit="s", least=0.1, most=60,
     )  # fmt: skip
     snippets: bool = setting(
-        False, "Whether the sound of each confirmed call is kept too, as WAV that `replay` reads."
+        False, "Whether the sound of each confirmed call is kept too, as FLAC that `replay` reads."
     )
     before_s: float = setting(
         3.0, "A snippet begins so long before the call was confirmed.", unit="s", least=0, most=30
@@ -651,7 +651,7 @@ class LogSettings:
     )
     longest_s: float = setting(60.0, "A snippet ends here at the latest.", unit="s", least=0.5, most=3600)
     snippets_mb: float = setting(
-        500.0, "All snippets; the oldest is deleted for a new one. Three microphones fill 7 MB a minute.",
+        500.0, "All snippets; the oldest is deleted for a new one. Three microphones fill 4 MB a minute.",
         unit="MB", least=0.01, most=1e6,
     )  # fmt: skip
 
