@@ -651,7 +651,7 @@ class LogSettings:
     )
     longest_s: float = setting(60.0, "A snippet ends here at the latest.", unit="s", least=0.5, most=3600)
     snippets_mb: float = setting(
-        500.0, "All snippets; the oldest is deleted for a new one. Three microphones fill 4 MB a minute.",
+        500.0, "All snippets; the oldest is deleted for a new one. Three microphones fill 4.5 MB a minute.",
         unit="MB", least=0.01, most=1e6,
     )  # fmt: skip
 

@@ -6,9 +6,8 @@ speed. What it is for is what lies between a companion's link and a ground stati
 - routing as ArduPilot's documentation has it (ardupilot.org/dev/docs/mavlink-routing-in-ardupilot.html):
   messages without a target, or to system 0, go on to every other link on which somebody has been heard; those
   for another component to the links on which it has been heard, or else are taken for the autopilot's own;
-  heartbeats to links on which their sender has not been heard; ADSB_VEHICLE to none; ids that its dialect
-  does not know are dropped, for their checksum cannot be verified; frames go on byte by byte, with number and
-  signature as they are;
+  heartbeats to links on which their sender has not been heard; ids that its dialect does not know are dropped,
+  for their checksum cannot be verified; frames go on byte by byte, with number and signature as they are;
 - no attitude and no position until MAV_CMD_SET_MESSAGE_INTERVAL asks for them, for the link that asked, until
   the next start;
 - signing by pymavlink's own implementation: with a key unsigned frames are refused without a word, but on the
@@ -129,7 +128,7 @@ class Autopilot:
     def _forward(self, channel: Channel, sender: tuple[int, int], message: Any) -> bool:
         """To other links. Whether it is for us too."""
         frame, others = bytes(message.get_msgbuf()), [c for c in self.channels if c is not channel]
-        if message.get_type() in ("RADIO_STATUS", "ADSB_VEHICLE"):
+        if message.get_type() == "RADIO_STATUS":
             return True
         if message.get_type() == "HEARTBEAT":
             for other in others:
