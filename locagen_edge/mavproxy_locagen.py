@@ -1,7 +1,7 @@
 """A MAVProxy module: bearing lines, ellipses of positions and a list of calls, on the map and in the console.
 
     pip install MAVProxy locagen-edge        # into one environment
-    module load locagen_edge.mavproxy_locagen
+    module load locagen                      # locagen.py, which is installed beside
     locagen                                  # the calls, the last first
     locagen clear | locagen length METRES    # of the map; how long a line is drawn
 

@@ -6,8 +6,8 @@ speed. What it is for is what lies between a companion's link and a ground stati
 - routing as ArduPilot's documentation has it (ardupilot.org/dev/docs/mavlink-routing-in-ardupilot.html):
   messages without a target, or to system 0, go on to every other link on which somebody has been heard; those
   for another component to the links on which it has been heard, or else are taken for the autopilot's own;
-  heartbeats to links on which their sender has not been heard; ids that its dialect does not know are dropped,
-  for their checksum cannot be verified; frames go on byte by byte, with number and signature as they are;
+  heartbeats to links on which their sender has not been heard; ids that its dialect does not know are
+  dropped, for their checksum cannot be verified; frames go on byte by byte, with number and signature;
 - no attitude and no position until MAV_CMD_SET_MESSAGE_INTERVAL asks for them, for the link that asked, until
   the next start;
 - signing by pymavlink's own implementation: with a key unsigned frames are refused without a word, but on the
