@@ -198,6 +198,23 @@ def test_without_poses_there_are_bearings_and_no_place(flown):
     assert not any(e.positions or e.sightings for e in heard)
 
 
+def test_two_microphones_bear_and_place_nobody():
+    """Their mirror image is as likely: on the wrong side of the line that is flown."""
+    settings = from_table(
+        {
+            "array": {"positions_m": [[0, 0.05, 0], [0, -0.05, 0]]},
+            "audio": {"channel_map": [0, 1]},
+            "bearing": {"estimator": "two-mic"},
+            "detection": {"snr_db": -20},
+            "sim": {"snr_db": 20, "call": "white"},
+        }
+    )
+    pipeline = Pipeline(settings)
+    heard = [pipeline.process(f) for f in flights.frames(settings, 5.0)]
+    assert any(e.track and e.track.confirmed and e.track.earth for e in heard)
+    assert not any(e.positions or e.sightings for e in heard)
+
+
 def test_calls_too_far_apart_for_one_track_are_one_caller_on_the_ground(flown):
     """2.5 s of silence end a track; what was seen of each adds up all the same."""
     settings = replace(flown.settings, sim=replace(flown.settings.sim, call_s=1.0, pause_s=2.5))

@@ -554,7 +554,9 @@ class Component:
                 continue
             how_far = _how_far(status, track) if track.id not in self._placed else ""
             if track.id not in self._told or how_far:
-                self._say(dialect.SEVERITY_NOTICE, call_text(track, how_far), first=True)
+                self._say(
+                    dialect.SEVERITY_NOTICE, call_text(track, how_far, ambiguous=status.ambiguous), first=True
+                )
                 self._told.append(track.id)
             if how_far:
                 self._placed.append(track.id)
@@ -605,20 +607,22 @@ def bearing_values(track: Track, snr_db: float) -> Iterator[tuple[str, float]]:
     yield from _value("LG_SNR", snr_db, -200, 200)
 
 
-def call_text(track: Track, how_far: str = "") -> str:
+def call_text(track: Track, how_far: str = "", *, ambiguous: bool = False) -> str:
     """One line for the operator, at most 50 characters: where a confirmed call comes from, with 1-sigma.
 
     `how_far`: the distance in words, where it is known; it takes the place of the bearing's sigma.
+    `ambiguous`: the mirror image at the axis of the microphones is as likely.
     """
-    body = _whole(compass_deg(track.azimuth_rad))
-    where, sigma = f"{body} deg clockwise from nose", math.degrees(track.azimuth_sigma_rad)
+    body = compass_deg(track.azimuth_rad)
+    sigma = math.degrees(track.azimuth_sigma_rad)
+    where = f"{_whole(body)} from nose" if ambiguous else f"{_whole(body)} deg clockwise from nose"
     if track.earth is not None and not math.isnan(true := compass_deg(track.earth.azimuth_rad)):
-        where, sigma = (
-            f"{_whole(true)} deg true, {body} from nose",
-            math.degrees(track.earth.azimuth_sigma_rad),
-        )
-        if how_far:
-            where = f"{_whole(true)} deg true"
+        sigma = math.degrees(track.earth.azimuth_sigma_rad)
+        where = f"{_whole(true)} deg true"
+        if not (how_far or ambiguous):
+            where += f", {_whole(body)} from nose"
+    if ambiguous:
+        where += " or mirrored"
     if how_far:
         text = f"Call heard: {where}, {how_far}"
         sure = f", conf {track.confidence:.1f}" if 0.0 <= track.confidence <= 1.0 else ""

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from hypothesis import given
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
 from test_component import CALLING, QUIET, TICK_S, decode, said, texts
@@ -175,6 +176,7 @@ def test_intervals_of_our_own_messages() -> None:
     assert ask(component, command(REQUEST, 244, 390))[1].interval_us == -1, "switched off"
 
 
+@hypothesis_settings(max_examples=20)  # minutes of a component's time each
 @given(st.lists(st.tuples(st.integers(0, 2), st.sampled_from([-1.0, 0.0, 1e5, 1e6, 4e6])), max_size=6))
 def test_an_interval_holds_on_the_link_that_asked_and_on_no_other(asked: list[tuple[int, float]]) -> None:
     component, wanted = Component(MavlinkSettings()), {0: 0.0, 1: 0.0, 2: 0.0}

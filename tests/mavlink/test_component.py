@@ -434,11 +434,15 @@ def test_any_text_fits_and_stays_readable(words: str) -> None:
     assert all(a == b or b == "?" for a, b in zip(words, text, strict=False))
 
 
-@given(st.floats(-10, 10), st.floats(0, 1e9) | st.just(math.nan), st.floats(-10, 10) | st.none())
-def test_a_calls_text_is_never_cut(azimuth: float, sigma: float, true: float | None) -> None:
+@given(
+    st.floats(-10, 10), st.floats(0, 1e9) | st.just(math.nan), st.floats(-10, 10) | st.none(), st.booleans()
+)
+def test_a_calls_text_is_never_cut(azimuth: float, sigma: float, true: float | None, ambiguous: bool) -> None:
     earth = None if true is None else TrueBearing(true, sigma, None, sigma)
     track = replace(TRACK, azimuth_rad=azimuth, azimuth_sigma_rad=sigma, earth=earth)
-    assert len(voice.call_text(track)) <= 50
+    text = voice.call_text(track, ambiguous=ambiguous)
+    assert len(text) <= 50
+    assert ("or mirrored" in text) == ambiguous
 
 
 # --- all of it ----------------------------------------------------------------------------------------
