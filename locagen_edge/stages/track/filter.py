@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from locagen_edge.geometry import angles, direction, wrap
+from locagen_edge.geometry import angles, direction, tangent, wrap
 from locagen_edge.settings import TrackSettings
 from locagen_edge.types import F64, Bearing
 
@@ -122,14 +122,6 @@ def mirrored(m: Measurement, normal: F64) -> Measurement:
     u = direction(m.azimuth, m.elevation or 0.0)
     azimuth, elevation = angles(u - 2.0 * float(u @ normal) * normal)
     return replace(m, azimuth=azimuth, elevation=elevation)
-
-
-def tangent(u: F64) -> F64:
-    """(2, 3): across a direction, level with the horizon (clockwise) and towards the zenith."""
-    x, y, z = u.tolist()
-    flat = math.hypot(x, y)
-    a, b = (-y / flat, x / flat) if flat > 1e-9 else (0.0, 1.0)
-    return np.array([[a, b, 0.0], [b * z, -a * z, a * y - b * x]])
 
 
 def born(m: Measurement, motion: Motion) -> State:

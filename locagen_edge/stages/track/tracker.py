@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from locagen_edge.geometry import angles, direction, rotation
+from locagen_edge.geometry import angles, direction, rotation, tangent
 from locagen_edge.settings import PoseSettings, TrackSettings
 from locagen_edge.stages.track import filter as sphere
 from locagen_edge.stages.track.association import associate
@@ -277,7 +277,7 @@ class Tracker:
         here = direction(m.azimuth, m.elevation or 0.0)
         there = self._turn @ here
         azimuth, elevation = angles(there)
-        rows = sphere.tangent(there) @ self._turn @ sphere.tangent(here).T
+        rows = tangent(there) @ self._turn @ tangent(here).T
         level, up = (rows**2 @ np.array([m.level_variance, m.up_variance])).tolist()
         azimuth_sigma = min(math.sqrt(level) / max(math.cos(elevation), 1e-9), NOWHERE_RAD)
         known = m.elevation is not None
@@ -291,7 +291,7 @@ class Tracker:
         variances on top, rad^2 across the direction."""
         u = turn @ caller.state.u
         azimuth, elevation = angles(u)
-        across = sphere.tangent(u) @ turn
+        across = tangent(u) @ turn
         variance = ((across @ caller.state.p[:3, :3] * across).sum(axis=1) + self._fixed).tolist()
         azimuth_sigma = math.sqrt(variance[0] + level) / max(math.cos(elevation), 1e-9)
         if not caller.elevation_known:
