@@ -100,6 +100,7 @@ class Daemon:
         self._told: BaseException | None = None
         self._links_up = 0
         self._said_s = -math.inf
+        self._sent_s = -math.inf
         self._save_s = math.inf
         self._complaints: tuple[str, ...] = ()
         self._applied = settings
@@ -327,6 +328,7 @@ class Daemon:
     def _send(self) -> None:
         """Sends what is due. While the link is down nothing is: it would be said to nobody."""
         up, now_s = self.links.up, time.monotonic()
+        self._sent_s = now_s
         # Who has just come up has heard nothing; but one that flaps must not make all others hear it again.
         if up > self._links_up and (not self._links_up or now_s - self._said_s > SAY_AGAIN_S):
             self.component.say_again()
@@ -372,7 +374,8 @@ class Daemon:
         next_s = time.monotonic() + 1.0
         while True:
             await asyncio.sleep(TICK_S)
-            self._send()
+            if time.monotonic() - self._sent_s > TICK_S / 2.0:  # each frame sends what is due, too
+                self._send()
             for number in range(len(self.links.links)):
                 self._answer(number)
             if time.monotonic() < next_s:

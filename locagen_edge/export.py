@@ -13,7 +13,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,9 @@ import numpy as np
 from locagen_edge import geodesy
 from locagen_edge.errors import ExportError
 from locagen_edge.files import write
+from locagen_edge.sightings import EPOCH
 from locagen_edge.types import Estimate, Position
 
-EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))
 """Semi-axes of the 95 % ellipse over those of 1-sigma: 2.45."""
 CORNERS = 48

@@ -77,10 +77,11 @@ ABOVE = {
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
     "store": GROUND | {"sightings"},
-    "export": GROUND,
-    "sightings": GROUND | {"export"},
+    "export": GROUND | {"sightings"},
+    "sightings": GROUND,
     "fusion": GROUND | {"stages"},
     "notify": set(),
+    "memory": set(),
     "mavproxy_locagen": GROUND | {"mavlink"},  # loaded by MAVProxy alone
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},

@@ -424,7 +424,8 @@ class Component:
             if asked:
                 yield "TIMESYNC", asked
         yield from self._due_texts(now_s)
-        if self._every[dialect.ONBOARD_COMPUTER_STATUS].due(now_s):
+        wanted_at_all = dialect.ONBOARD_COMPUTER_STATUS in self._allowed  # its reading costs milliseconds
+        if wanted_at_all and self._every[dialect.ONBOARD_COMPUTER_STATUS].due(now_s):
             computer = self._hands.computer(round(now_s * 1e9))
             if computer is not None:
                 yield "ONBOARD_COMPUTER_STATUS", computer

@@ -115,8 +115,8 @@ def _inverse(a: F64) -> F64:
     rest = second - shared * first
     rest2 = float(rest @ rest)
     if rest2 <= 1e-18 * length2 or length2 <= 1e-18 * rest2:
-        return np.linalg.pinv(a, rcond=1e-9)
-    inverse = np.empty((2, len(a)))
+        return np.asarray(np.linalg.pinv(a, rcond=1e-9), dtype=np.float64)
+    inverse: F64 = np.empty((2, len(a)))
     inverse[1] = rest / rest2
     inverse[0] = first / length2 - shared * inverse[1]
     return inverse

@@ -1,0 +1,447 @@
+"""The whole daemon as it runs on the board: CPU, memory, threads, files, delay and growth.
+
+    python bench/bench_daemon.py [--quick] [--frames N] [--output FILE]
+
+The real process, `locagen-edge run`, hears a scene in real time: a recording of 48 kHz and 16 bit, rendered
+beforehand, resampled by the daemon, so that the synthesis costs it nothing. Chains:
+
+    paper    GCC-PHAT and a plane wave's least squares (bearing.estimator = "far-field")
+    steered  the default
+    mask     the default with the network that says which frequencies are the caller's
+
+and, in the same run, `plain_daemon.py`: numpy and mavutil, as most people would write it.
+
+CPU is the process's own time (user and system, without its start) over the wall's. PSS is what
+/proc/PID/smaps_rollup says at the end. Delay is from a frame's last sample to the datagram on the loopback,
+as the kernel has stamped it; there the daemon sends every frame's bearing (mavlink.rate_hz = 20). Growth: the
+daemon in this process, fed with frames as fast as it takes them; slope of its resident memory over the second
+half. The process runs in an empty folder with a home of its own: what is there afterwards beyond the state
+directory is listed, and, where strace is installed, every file that was opened for writing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import re
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import AsyncGenerator, Iterator
+from dataclasses import dataclass, replace
+from itertools import count, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import report
+import soundfile
+from pymavlink import mavutil
+
+from locagen_edge.daemon import Daemon
+from locagen_edge.mavlink import dialect
+from locagen_edge.mavlink.framer import Framer
+from locagen_edge.memory import one_arena
+from locagen_edge.settings import Settings, from_table
+from locagen_edge.sim.scene import Scene, frames
+from locagen_edge.types import Estimate, Frame
+
+CHAINS: dict[str, dict[str, Any]] = {
+    "paper": {"bearing": {"estimator": "far-field"}},
+    "steered": {},
+    "mask": {"denoise": {"kind": "mask"}},
+}
+GOALS: dict[str, dict[str, float]] = {
+    "paper": {"cpu_percent": 1.0, "pss_mib": 75.0, "first_bearing_s": 1.5},
+    "mask": {"cpu_percent": 4.0, "pss_mib": 75.0},
+}
+DELAY_GOAL_MS = {"median": 2.0, "p99": 5.0}
+RATE_HZ = 48_000
+QUIET_S = {"paper": 0.3, "steered": 1.6, "mask": 1.6}
+"""Noise before the first call: the steered estimator has to have heard the rotors before it hears anybody."""
+WARM_S = 5.0
+SO_TIMESTAMPNS = 35
+"""Linux, <asm-generic/socket.h>: not in Python's socket module"""
+
+
+# --- the scene ----------------------------------------------------------------------------------------
+
+
+def render(path: Path, seconds: float, quiet_s: float) -> None:
+    """The default scene at the card's rate, 16 bit; nobody calls for `quiet_s`."""
+    scene = Scene(from_table({"audio": {"rate_hz": RATE_HZ, "frame": 4096, "hop": 2048}}))
+    quiet = round(quiet_s * RATE_HZ)
+    n = round(seconds * RATE_HZ)
+    held = np.zeros((3, quiet), dtype=np.float32)
+    with soundfile.SoundFile(path, "w", RATE_HZ, 3, "PCM_16") as file:
+        for first in range(0, n, RATE_HZ):
+            call, *others = scene.parts(min(RATE_HZ, n - first))
+            late = np.concatenate([held, call], axis=1)
+            held = late[:, call.shape[1] :]
+            file.write((late[:, : call.shape[1]] + sum(others)).T)
+
+
+def write_settings(path: Path, sound: Path, port: int, table: dict[str, Any], rate_hz: float) -> None:
+    tables = {
+        "audio": {"source": "wav", "file": str(sound)},
+        "mavlink": {"link": [f"udpout:127.0.0.1:{port}"], "rate_hz": rate_hz},
+        **table,
+    }
+    lines = []
+    for name, keys in tables.items():
+        lines.append(f"[{name}]")
+        lines += [f"{key} = {value!r}".replace("'", '"') for key, value in keys.items()]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+# --- the other end ------------------------------------------------------------------------------------
+
+
+class Peer:
+    """Takes datagrams, each with the kernel's own time of arrival, in monotonic ns."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[int, bytes]] = []
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.2)
+        self.port = int(self._socket.getsockname()[1])
+        self._open = True
+        self._thread = threading.Thread(target=self._take)
+        self._thread.start()
+
+    def _take(self) -> None:
+        while self._open:
+            with contextlib.suppress(TimeoutError):
+                data, ancillary, _, _ = self._socket.recvmsg(2048, 64)
+                stamp_ns = time.monotonic_ns()
+                for level, kind, value in ancillary:
+                    if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
+                        seconds, ns = struct.unpack("qq", value)
+                        stamp_ns += seconds * 1_000_000_000 + ns - time.time_ns()
+                self.heard.append((stamp_ns, data))
+
+    def close(self) -> list[tuple[int, bytes]]:
+        self._open = False
+        self._thread.join()
+        self._socket.close()
+        return self.heard
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What the peer made of it."""
+
+    delays_s: list[float]
+    """from the last sample to the datagram, of each bearing"""
+    first_ns: int | None
+    """when the first bearing came"""
+
+
+def ours(datagrams: list[tuple[int, bytes]], frame_s: float) -> Heard:
+    """Of LOCAGEN_BEARING: its time is that of the sound's middle."""
+    framer, delays, first = Framer(), {}, None
+    for stamp_ns, data in datagrams:
+        for packet in framer.feed(data):
+            if packet.message_id != dialect.LOCAGEN_BEARING:
+                continue
+            message = dialect.decode(packet.raw)
+            if message.event_id > 0:
+                first = first or stamp_ns
+            # the first time that this frame is told of: the same may be said again
+            delays.setdefault(message.time_usec, (stamp_ns * 1e-3 - message.time_usec) * 1e-6 - frame_s / 2)
+    return Heard(list(delays.values()), first)
+
+
+def plain(datagrams: list[tuple[int, bytes]]) -> Heard:
+    """Of DEBUG_VECT."""
+    parser = mavutil.mavlink.MAVLink(None)
+    parser.robust_parsing = True
+    delays, first = [], None
+    for stamp_ns, data in datagrams:
+        for message in parser.parse_buffer(data) or ():
+            if message.get_type() == "DEBUG_VECT":
+                first = first or stamp_ns
+                delays.append((stamp_ns * 1e-3 - message.time_usec) * 1e-6)
+    return Heard(delays, first)
+
+
+# --- a process ----------------------------------------------------------------------------------------
+
+
+def cpu_s(pid: int) -> float:
+    """Time of all threads on a core, user and system."""
+    spent = 0
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError):
+            spent += int((task / "schedstat").read_text().split()[0])
+    return spent * 1e-9
+
+
+def memory_mib(pid: int) -> dict[str, float]:
+    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    found = {key: int(kb) / 1024 for key, kb in re.findall(r"^(\w+): +(\d+) kB", text, re.MULTILINE)}
+    private = found["Private_Clean"] + found["Private_Dirty"]
+    return {"pss_mib": found["Pss"], "rss_mib": found["Rss"], "private_mib": private}
+
+
+def threads(pid: int) -> int:
+    return len(list(Path(f"/proc/{pid}/task").iterdir()))
+
+
+def listing(folder: Path) -> set[str]:
+    return {str(p.relative_to(folder)) for p in folder.rglob("*") if not p.is_dir()}
+
+
+class Home:
+    """A place of its own to run in: what is written shows."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        for name in ("home", "tmp", "state", "work"):
+            (folder / name).mkdir(parents=True)
+
+    @property
+    def environment(self) -> dict[str, str]:
+        kept = {"PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "VIRTUAL_ENV"}
+        return {key: value for key, value in os.environ.items() if key in kept} | {
+            "HOME": str(self.folder / "home"),
+            "TMPDIR": str(self.folder / "tmp"),
+            "STATE_DIRECTORY": str(self.folder / "state"),
+            "PYTHONPATH": str(report.ROOT),
+            "OPENBLAS_NUM_THREADS": "1",  # as in the unit
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
+
+    def start(self, command: list[str]) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            command, cwd=self.folder / "work", env=self.environment, stderr=subprocess.DEVNULL
+        )
+
+    @property
+    def strays(self) -> list[str]:
+        """Files beyond the state directory."""
+        return sorted(name for name in listing(self.folder) if not name.startswith("state/"))
+
+
+def stop(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(5.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def measure(command: list[str], home: Home, seconds: float) -> dict[str, Any]:
+    """CPU, memory, threads and strays of a process that has run for WARM_S, over `seconds`."""
+    process = home.start(command)
+    try:
+        time.sleep(WARM_S)
+        before, start = cpu_s(process.pid), time.monotonic()
+        time.sleep(seconds)
+        spent, wall = cpu_s(process.pid) - before, time.monotonic() - start
+        found = {
+            "cpu_percent": 100.0 * spent / wall,
+            **memory_mib(process.pid),
+            "threads": threads(process.pid),
+        }
+    finally:
+        stop(process)
+    return found | {"files_outside_state": home.strays}
+
+
+def listen(command: list[str], home: Home, peer: Peer, seconds: float) -> tuple[int, list[tuple[int, bytes]]]:
+    """When the process was started, and all it has sent."""
+    start_ns = time.monotonic_ns()
+    process = home.start(command)
+    try:
+        time.sleep(seconds)
+    finally:
+        stop(process)
+    return start_ns, peer.close()
+
+
+def opened_for_writing(command: list[str], home: Home, seconds: float) -> list[str] | None:
+    """Every file beyond the state directory that was opened for writing or made; None without strace."""
+    if shutil.which("strace") is None:
+        return None
+    log = home.folder / "strace"
+    calls = "trace=open,openat,creat,mkdir,mkdirat,rename,renameat,renameat2,unlink,unlinkat,link,symlink"
+    process = home.start(["strace", "-f", "-qq", "-e", calls, "-o", str(log), *command])
+    time.sleep(seconds)
+    stop(process)
+    text = log.read_text(encoding="utf-8", errors="replace")
+    written = set()
+    for line in text.splitlines():
+        if " = -1 " in line or not (path := re.search(r'"([^"]+)"', line)):
+            continue
+        changes = not re.search(r"\bopen(at)?\(", line) or re.search(r"O_(WRONLY|RDWR|CREAT)", line)
+        if changes and not path[1].startswith((str(home.folder / "state"), "/dev/")):
+            written.add(path[1])
+    return sorted(written)
+
+
+def chain(name: str, folder: Path, seconds: float, runs: int) -> dict[str, Any]:
+    """All figures of one chain's daemon."""
+    sound = folder / f"{name}.wav"
+    render(sound, max(seconds + WARM_S, 8.0) + 5.0, QUIET_S[name])
+    settings = folder / f"{name}.toml"
+    command = [sys.executable, "-m", "locagen_edge", "run", "--quiet", "--settings", str(settings)]
+    hop = from_table({})
+    frame_s = hop.audio.frame / hop.audio.rate_hz
+
+    peer = Peer()  # somebody listens, or each datagram costs an error as well
+    write_settings(settings, sound, peer.port, CHAINS[name], 2.0)
+    found = measure(command, Home(folder / f"{name}-cpu"), seconds)
+    found["files_opened_for_writing"] = opened_for_writing(command, Home(folder / f"{name}-files"), 6.0)
+    peer.close()
+
+    delays, firsts = [], []
+    for run in range(runs):
+        peer = Peer()
+        write_settings(settings, sound, peer.port, CHAINS[name], 20.0)
+        start_ns, datagrams = listen(command, Home(folder / f"{name}-{run}"), peer, max(8.0, seconds / runs))
+        heard = ours(datagrams, frame_s)
+        delays += heard.delays_s
+        if heard.first_ns:
+            firsts.append((heard.first_ns - start_ns) * 1e-9)
+    found["delay_ms"] = report.summary([1e3 * delay for delay in delays]) | {"bearings": len(delays)}
+    found["first_bearing_s"] = float(np.median(firsts)) if firsts else None
+    return found
+
+
+def plain_daemon(folder: Path, seconds: float) -> dict[str, Any]:
+    """The same of the plain one, on the paper chain's sound."""
+    sound = folder / "paper.wav"
+    command = [sys.executable, str(report.ROOT / "bench" / "plain_daemon.py"), str(sound)]
+    peer = Peer()
+    found = measure([*command, f"udpout:127.0.0.1:{peer.port}"], Home(folder / "plain-cpu"), seconds)
+    peer.close()
+    peer = Peer()
+    address = f"udpout:127.0.0.1:{peer.port}"
+    start_ns, datagrams = listen([*command, address], Home(folder / "plain-0"), peer, 8.0)
+    heard = plain(datagrams)
+    found["delay_ms"] = report.summary([1e3 * delay for delay in heard.delays_s])
+    found["first_bearing_s"] = (heard.first_ns - start_ns) * 1e-9 if heard.first_ns else None
+    return found
+
+
+# --- growth -------------------------------------------------------------------------------------------
+
+
+def growth(total: int) -> dict[str, Any]:
+    """Resident memory of the default daemon in this process over so many frames."""
+    one_arena()  # as `locagen-edge run` does
+    peer = Peer()
+    table = {"mavlink": {"link": [f"udpout:127.0.0.1:{peer.port}"]}}
+    with tempfile.TemporaryDirectory() as folder:
+        settings = from_table(table | {"log": {"directory": folder, "total_mb": 20.0, "part_mb": 2.0}})
+        scene = list(islice(frames(settings), min(total, 2000)))
+        rss: list[tuple[int, float]] = []
+        start_s = time.monotonic()
+
+        def each(_: Frame, __: Estimate) -> None:
+            done = daemon.counters.estimates
+            if done % max(total // 100, 1) == 0:
+                rss.append((done, memory_mib(os.getpid())["rss_mib"]))
+                peer.heard.clear()
+            if done >= total - 1:
+                daemon.stop()
+
+        daemon = _daemon(settings, scene, each)
+        asyncio.run(_run(daemon))
+        seconds = time.monotonic() - start_s
+    peer.close()
+    late = np.array(rss[len(rss) // 2 :])
+    slope = float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) if len(late) > 2 else float("nan")
+    return {
+        "frames": daemon.counters.estimates,
+        "dropped": daemon.counters.dropped,
+        "seconds": seconds,
+        "rss_mib": [round(mib, 2) for _, mib in rss],
+        "slope_mib_per_million_frames": slope * 1e6,
+    }
+
+
+def _daemon(settings: Settings, scene: list[Frame], each: Any) -> Daemon:
+    async def source(_: Settings) -> AsyncGenerator[Frame, None]:
+        for frame in _endless(scene, settings):
+            yield frame
+            while daemon._queue.qsize() >= 4:  # noqa: ASYNC110  as fast as it takes them, and no faster
+                await asyncio.sleep(0)
+
+    daemon = Daemon(settings, sources=source, on_estimate=each)
+    return daemon
+
+
+def _endless(scene: list[Frame], settings: Settings) -> Iterator[Frame]:
+    """The scene again and again, time going on."""
+    hop_ns, first_ns = round(settings.hop_s * 1e9), time.monotonic_ns()
+    for n in count():
+        yield replace(scene[n % len(scene)], t_ns=first_ns + n * hop_ns, start=n * settings.audio.hop)
+
+
+async def _run(daemon: Daemon) -> None:
+    await daemon.startup()
+    try:
+        await daemon.main_loop()
+    finally:
+        await daemon.shutdown()
+
+
+# --- report -------------------------------------------------------------------------------------------
+
+
+def show(name: str, found: dict[str, Any]) -> None:
+    delay, first = found["delay_ms"], found["first_bearing_s"]
+    print(
+        f"{name:10}{found['cpu_percent']:7.2f} %{found['pss_mib']:8.1f}{found['private_mib']:8.1f}"
+        f"{found['threads']:9}{delay['median']:10.2f}{delay['p99']:8.2f}"
+        f"{first if first is not None else float('nan'):11.2f}"
+        f"{len(found['files_outside_state']):7}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument(
+        "--quick", action="store_true", help="seconds instead of minutes: a test that it runs"
+    )
+    parser.add_argument("--frames", type=int, default=1_000_000, help="for growth (default 1,000,000)")
+    parser.add_argument("--output", type=Path, default=report.default("daemon"))
+    options = parser.parse_args()
+    seconds, runs = (3.0, 1) if options.quick else (60.0, 5)
+    results: dict[str, Any] = {}
+    print(
+        f"{'':10}{'CPU':>9}{'PSS MiB':>8}{'own':>8}{'threads':>9}{'delay ms':>10}{'p99':>8}"
+        f"{'first, s':>11}{'strays':>7}"
+    )
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for chosen in list(CHAINS)[:1] if options.quick else CHAINS:
+            results[chosen] = chain(chosen, folder, seconds, runs)
+            show(chosen, results[chosen])
+        results["plain"] = plain_daemon(folder, seconds)
+        show("plain", results["plain"])
+    grown = growth(1000 if options.quick else options.frames)
+    print(
+        f"growth: {grown['slope_mib_per_million_frames']:+.2f} MiB per million frames "
+        f"({grown['frames']} frames in {grown['seconds']:.0f} s)"
+    )
+    goals = {"chains": GOALS, "delay_ms": DELAY_GOAL_MS}
+    report.write(options.output, daemons=results, growth=grown, goals=goals)
+    print(f"written to {options.output}")
+
+
+if __name__ == "__main__":
+    main()
