@@ -21,9 +21,7 @@ from locagen_edge.cli import main
 def look():
     tasks = len(os.listdir("/proc/self/task"))
     names = [thread.name for thread in threading.enumerate() if thread is not threading.current_thread()]
-    new = sorted(set(sys.modules) - before)
-    loaded = [name for name in new if getattr(sys.modules[name], "__file__", None)]
-    found.update(modules=loaded, native=tasks - len(names) - 1, threads=names)
+    found.update(native=tasks - len(names) - 1, threads=names)
 
 found = {}
 watch = threading.Timer(1.2, look)
@@ -32,6 +30,8 @@ try:
     main(["run", "--quiet", "--seconds", "1.3", "--settings", sys.argv[1]])
 except SystemExit as end:
     found["code"] = end.code
+new = sorted(set(sys.modules) - before)
+found["modules"] = [name for name in new if getattr(sys.modules[name], "__file__", None)]
 print(json.dumps(found))
 """
 
