@@ -13,17 +13,19 @@ and, in the same run, `plain_daemon.py`: numpy and mavutil, as most people would
 
 CPU is the process's own time (user and system, without its start) over the wall's. PSS is what
 /proc/PID/smaps_rollup says at the end. Delay is from a frame's last sample to the datagram on the loopback,
-as the kernel has stamped it; there the daemon sends every frame's bearing (mavlink.rate_hz = 20). Growth: the
-daemon in this process, fed with frames as fast as it takes them; slope of its resident memory over the second
-half. The process runs in an empty folder with a home of its own: what is there afterwards beyond the state
-directory is listed, and, where strace is installed, every file that was opened for writing.
+as the kernel has stamped it; there the daemon sends every frame's bearing (mavlink.rate_hz = 20). Growth:
+frames go through pipeline and MAVLink component in this process as fast as they can; slope of its resident
+memory over the second half. `nothing` is what as many wake-ups cost without any work: a loop of asyncio that
+hands an empty job to a thread at every hop. The process runs in an empty folder with a home of its own: what
+is there afterwards beyond the state directory is listed, and, where strace is installed, every file that was
+opened for writing.
 """
 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import contextlib
+import math
 import os
 import re
 import shutil
@@ -35,9 +37,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import AsyncGenerator, Iterator
 from dataclasses import dataclass, replace
-from itertools import count, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +47,12 @@ import report
 import soundfile
 from pymavlink import mavutil
 
-from locagen_edge.daemon import Daemon
 from locagen_edge.mavlink import dialect
+from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.framer import Framer
-from locagen_edge.memory import one_arena
-from locagen_edge.settings import Settings, from_table
+from locagen_edge.pipeline import Pipeline
+from locagen_edge.settings import from_table
 from locagen_edge.sim.scene import Scene, frames
-from locagen_edge.types import Estimate, Frame
 
 CHAINS: dict[str, dict[str, Any]] = {
     "paper": {"bearing": {"estimator": "far-field"}},
@@ -68,6 +68,17 @@ RATE_HZ = 48_000
 QUIET_S = {"paper": 0.3, "steered": 1.6, "mask": 1.6}
 """Noise before the first call: the steered estimator has to have heard the rotors before it hears anybody."""
 WARM_S = 5.0
+WINDOW_S = 5.0
+"""CPU is told of the least busy and the middling one of such windows: a machine has other things to do."""
+NOTHING = """
+import asyncio, concurrent.futures
+async def main():
+    executor, loop = concurrent.futures.ThreadPoolExecutor(1), asyncio.get_running_loop()
+    while True:
+        await asyncio.sleep(0.0512)
+        await loop.run_in_executor(executor, int)
+asyncio.run(main())
+"""
 SO_TIMESTAMPNS = 35
 """Linux, <asm-generic/socket.h>: not in Python's socket module"""
 
@@ -247,11 +258,15 @@ def measure(command: list[str], home: Home, seconds: float) -> dict[str, Any]:
     process = home.start(command)
     try:
         time.sleep(WARM_S)
-        before, start = cpu_s(process.pid), time.monotonic()
-        time.sleep(seconds)
-        spent, wall = cpu_s(process.pid) - before, time.monotonic() - start
+        shares = []
+        for _ in range(max(1, round(seconds / WINDOW_S))):
+            before, start = cpu_s(process.pid), time.monotonic()
+            time.sleep(min(WINDOW_S, seconds))
+            shares.append(100.0 * (cpu_s(process.pid) - before) / (time.monotonic() - start))
         found = {
-            "cpu_percent": 100.0 * spent / wall,
+            "cpu_percent": float(np.median(shares)),
+            "cpu_percent_least": min(shares),
+            "load": os.getloadavg()[0],
             **memory_mib(process.pid),
             "threads": threads(process.pid),
         }
@@ -340,75 +355,48 @@ def plain_daemon(folder: Path, seconds: float) -> dict[str, Any]:
 
 
 def growth(total: int) -> dict[str, Any]:
-    """Resident memory of the default daemon in this process over so many frames."""
-    one_arena()  # as `locagen-edge run` does
-    peer = Peer()
-    table = {"mavlink": {"link": [f"udpout:127.0.0.1:{peer.port}"]}}
-    with tempfile.TemporaryDirectory() as folder:
-        settings = from_table(table | {"log": {"directory": folder, "total_mb": 20.0, "part_mb": 2.0}})
-        scene = list(islice(frames(settings), min(total, 2000)))
-        rss: list[tuple[int, float]] = []
-        start_s = time.monotonic()
-
-        def each(_: Frame, __: Estimate) -> None:
-            done = daemon.counters.estimates
-            if done % max(total // 100, 1) == 0:
-                rss.append((done, memory_mib(os.getpid())["rss_mib"]))
-                peer.heard.clear()
-            if done >= total - 1:
-                daemon.stop()
-
-        daemon = _daemon(settings, scene, each)
-        asyncio.run(_run(daemon))
-        seconds = time.monotonic() - start_s
-    peer.close()
+    """Resident memory of the default chain, sound to MAVLink frames, in this process over so many frames."""
+    settings = from_table({})
+    pipeline, component = Pipeline(settings), Component(settings.mavlink, whole=settings)
+    scene = list(islice(frames(settings), min(total, 2000)))
+    hop_ns = round(settings.hop_s * 1e9)
+    rss: list[tuple[int, float]] = []
+    sent, start_s = 0, time.monotonic()
+    for n in range(total):  # the scene again and again, time going on
+        frame = replace(scene[n % len(scene)], t_ns=n * hop_ns, start=n * settings.audio.hop)
+        estimate = pipeline.process(frame)
+        status = Status(
+            hearing=True,
+            track=estimate.track,
+            snr_db=estimate.detection.snr_db,
+            faults=estimate.faults,
+            others=estimate.tracks[1:],
+            positions=estimate.positions,
+            t_ns=frame.middle_ns,
+        )
+        sent += len(component.due(frame.t_ns * 1e-9, status))
+        if n % max(total // 100, 1) == 0:
+            rss.append((n, memory_mib(os.getpid())["rss_mib"]))
     late = np.array(rss[len(rss) // 2 :])
-    slope = float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) if len(late) > 2 else float("nan")
     return {
-        "frames": daemon.counters.estimates,
-        "dropped": daemon.counters.dropped,
-        "seconds": seconds,
+        "frames": total,
+        "messages": sent,
+        "seconds": time.monotonic() - start_s,
         "rss_mib": [round(mib, 2) for _, mib in rss],
-        "slope_mib_per_million_frames": slope * 1e6,
+        "slope_mib_per_million_frames": float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) * 1e6,
     }
-
-
-def _daemon(settings: Settings, scene: list[Frame], each: Any) -> Daemon:
-    async def source(_: Settings) -> AsyncGenerator[Frame, None]:
-        for frame in _endless(scene, settings):
-            yield frame
-            while daemon._queue.qsize() >= 4:  # noqa: ASYNC110  as fast as it takes them, and no faster
-                await asyncio.sleep(0)
-
-    daemon = Daemon(settings, sources=source, on_estimate=each)
-    return daemon
-
-
-def _endless(scene: list[Frame], settings: Settings) -> Iterator[Frame]:
-    """The scene again and again, time going on."""
-    hop_ns, first_ns = round(settings.hop_s * 1e9), time.monotonic_ns()
-    for n in count():
-        yield replace(scene[n % len(scene)], t_ns=first_ns + n * hop_ns, start=n * settings.audio.hop)
-
-
-async def _run(daemon: Daemon) -> None:
-    await daemon.startup()
-    try:
-        await daemon.main_loop()
-    finally:
-        await daemon.shutdown()
 
 
 # --- report -------------------------------------------------------------------------------------------
 
 
 def show(name: str, found: dict[str, Any]) -> None:
-    delay, first = found["delay_ms"], found["first_bearing_s"]
+    delay, first = found.get("delay_ms", {}), found.get("first_bearing_s")
     print(
-        f"{name:10}{found['cpu_percent']:7.2f} %{found['pss_mib']:8.1f}{found['private_mib']:8.1f}"
-        f"{found['threads']:9}{delay['median']:10.2f}{delay['p99']:8.2f}"
-        f"{first if first is not None else float('nan'):11.2f}"
-        f"{len(found['files_outside_state']):7}"
+        f"{name:10}{found['cpu_percent']:7.2f} %{found['cpu_percent_least']:7.2f} %"
+        f"{found['pss_mib']:9.1f}{found['private_mib']:8.1f}{found['threads']:9}"
+        f"{delay.get('median', math.nan):10.2f}{delay.get('p99', math.nan):8.2f}"
+        f"{math.nan if first is None else first:10.2f}{len(found['files_outside_state']):8}"
     )
 
 
@@ -423,8 +411,8 @@ def main() -> None:
     seconds, runs = (3.0, 1) if options.quick else (60.0, 5)
     results: dict[str, Any] = {}
     print(
-        f"{'':10}{'CPU':>9}{'PSS MiB':>8}{'own':>8}{'threads':>9}{'delay ms':>10}{'p99':>8}"
-        f"{'first, s':>11}{'strays':>7}"
+        f"{'':10}{'CPU':>9}{'least':>9}{'PSS MiB':>9}{'own':>8}{'threads':>9}{'delay ms':>10}{'p99':>8}"
+        f"{'first, s':>10}{'strays':>8}"
     )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -433,6 +421,8 @@ def main() -> None:
             show(chosen, results[chosen])
         results["plain"] = plain_daemon(folder, seconds)
         show("plain", results["plain"])
+        results["nothing"] = measure([sys.executable, "-c", NOTHING], Home(folder / "nothing"), seconds)
+        show("nothing", results["nothing"])
     grown = growth(1000 if options.quick else options.frames)
     print(
         f"growth: {grown['slope_mib_per_million_frames']:+.2f} MiB per million frames "
