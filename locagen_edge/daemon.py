@@ -252,15 +252,15 @@ class Daemon:
             estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
             self.estimate, self._middle_ns = estimate, frame.middle_ns
             self._working = False
-            if self.black_box is not None:
-                self.black_box.hear(frame, estimate)
-            if self._on_estimate is not None:
-                self._on_estimate(frame, estimate)
             self._heard_s = time.monotonic()
             self.counters.estimates += 1
             end_ns = 2 * frame.middle_ns - frame.t_ns
             self.counters.latency_s.append((time.monotonic_ns() - end_ns) * 1e-9)
-            self._send()
+            self._send()  # first: all else can wait
+            if self.black_box is not None:
+                self.black_box.hear(frame, estimate)
+            if self._on_estimate is not None:
+                self._on_estimate(frame, estimate)
             self._tell_ready()
 
     # --- what is asked over MAVLink: none of it waits
