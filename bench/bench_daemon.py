@@ -67,7 +67,6 @@ DELAY_GOAL_MS = {"median": 2.0, "p99": 5.0}
 RATE_HZ = 48_000
 QUIET_S = {"paper": 0.3, "steered": 1.6, "mask": 1.6}
 """Noise before the first call: the steered estimator has to have heard the rotors before it hears anybody."""
-WARM_S = 5.0
 WINDOW_S = 5.0
 """CPU is told of the least busy and the middling one of such windows: a machine has other things to do."""
 NOTHING = """
@@ -81,6 +80,23 @@ asyncio.run(main())
 """
 SO_TIMESTAMPNS = 35
 """Linux, <asm-generic/socket.h>: not in Python's socket module"""
+
+
+@dataclass(frozen=True)
+class Times:
+    """How long, in seconds."""
+
+    warm: float
+    """before a process is measured"""
+    measure: float
+    trace: float
+    listen: float
+    """to what a process sends, from its start"""
+    starts: int
+    """how often it is started to be listened to"""
+
+
+FULL, QUICK = Times(5.0, 60.0, 6.0, 12.0, 5), Times(1.5, 1.0, 2.5, 3.5, 1)
 
 
 # --- the scene ----------------------------------------------------------------------------------------
@@ -253,15 +269,15 @@ def stop(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def measure(command: list[str], home: Home, seconds: float) -> dict[str, Any]:
-    """CPU, memory, threads and strays of a process that has run for WARM_S, over `seconds`."""
+def measure(command: list[str], home: Home, times: Times) -> dict[str, Any]:
+    """CPU, memory, threads and strays of a process that has run for a while."""
     process = home.start(command)
     try:
-        time.sleep(WARM_S)
+        time.sleep(times.warm)
         shares = []
-        for _ in range(max(1, round(seconds / WINDOW_S))):
+        for _ in range(max(1, round(times.measure / WINDOW_S))):
             before, start = cpu_s(process.pid), time.monotonic()
-            time.sleep(min(WINDOW_S, seconds))
+            time.sleep(min(WINDOW_S, times.measure))
             shares.append(100.0 * (cpu_s(process.pid) - before) / (time.monotonic() - start))
         found = {
             "cpu_percent": float(np.median(shares)),
@@ -306,10 +322,10 @@ def opened_for_writing(command: list[str], home: Home, seconds: float) -> list[s
     return sorted(written)
 
 
-def chain(name: str, folder: Path, seconds: float, runs: int) -> dict[str, Any]:
+def chain(name: str, folder: Path, times: Times) -> dict[str, Any]:
     """All figures of one chain's daemon."""
     sound = folder / f"{name}.wav"
-    render(sound, max(seconds + WARM_S, 8.0) + 5.0, QUIET_S[name])
+    render(sound, max(times.warm + times.measure, times.listen) + 5.0, QUIET_S[name])
     settings = folder / f"{name}.toml"
     command = [sys.executable, "-m", "locagen_edge", "run", "--quiet", "--settings", str(settings)]
     hop = from_table({})
@@ -317,15 +333,17 @@ def chain(name: str, folder: Path, seconds: float, runs: int) -> dict[str, Any]:
 
     peer = Peer()  # somebody listens, or each datagram costs an error as well
     write_settings(settings, sound, peer.port, CHAINS[name], 2.0)
-    found = measure(command, Home(folder / f"{name}-cpu"), seconds)
-    found["files_opened_for_writing"] = opened_for_writing(command, Home(folder / f"{name}-files"), 6.0)
+    found = measure(command, Home(folder / f"{name}-cpu"), times)
+    found["files_opened_for_writing"] = opened_for_writing(
+        command, Home(folder / f"{name}-files"), times.trace
+    )
     peer.close()
 
     delays, firsts = [], []
-    for run in range(runs):
+    for run in range(times.starts):
         peer = Peer()
         write_settings(settings, sound, peer.port, CHAINS[name], 20.0)
-        start_ns, datagrams = listen(command, Home(folder / f"{name}-{run}"), peer, max(8.0, seconds / runs))
+        start_ns, datagrams = listen(command, Home(folder / f"{name}-{run}"), peer, times.listen)
         heard = ours(datagrams, frame_s)
         delays += heard.delays_s
         if heard.first_ns:
@@ -335,16 +353,16 @@ def chain(name: str, folder: Path, seconds: float, runs: int) -> dict[str, Any]:
     return found
 
 
-def plain_daemon(folder: Path, seconds: float) -> dict[str, Any]:
+def plain_daemon(folder: Path, times: Times) -> dict[str, Any]:
     """The same of the plain one, on the paper chain's sound."""
     sound = folder / "paper.wav"
     command = [sys.executable, str(report.ROOT / "bench" / "plain_daemon.py"), str(sound)]
     peer = Peer()
-    found = measure([*command, f"udpout:127.0.0.1:{peer.port}"], Home(folder / "plain-cpu"), seconds)
+    found = measure([*command, f"udpout:127.0.0.1:{peer.port}"], Home(folder / "plain-cpu"), times)
     peer.close()
     peer = Peer()
     address = f"udpout:127.0.0.1:{peer.port}"
-    start_ns, datagrams = listen([*command, address], Home(folder / "plain-0"), peer, 8.0)
+    start_ns, datagrams = listen([*command, address], Home(folder / "plain-0"), peer, times.listen)
     heard = plain(datagrams)
     found["delay_ms"] = report.summary([1e3 * delay for delay in heard.delays_s])
     found["first_bearing_s"] = (heard.first_ns - start_ns) * 1e-9 if heard.first_ns else None
@@ -408,7 +426,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=1_000_000, help="for growth (default 1,000,000)")
     parser.add_argument("--output", type=Path, default=report.default("daemon"))
     options = parser.parse_args()
-    seconds, runs = (3.0, 1) if options.quick else (60.0, 5)
+    times = QUICK if options.quick else FULL
     results: dict[str, Any] = {}
     print(
         f"{'':10}{'CPU':>9}{'least':>9}{'PSS MiB':>9}{'own':>8}{'threads':>9}{'delay ms':>10}{'p99':>8}"
@@ -417,11 +435,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for chosen in list(CHAINS)[:1] if options.quick else CHAINS:
-            results[chosen] = chain(chosen, folder, seconds, runs)
+            results[chosen] = chain(chosen, folder, times)
             show(chosen, results[chosen])
-        results["plain"] = plain_daemon(folder, seconds)
+        results["plain"] = plain_daemon(folder, times)
         show("plain", results["plain"])
-        results["nothing"] = measure([sys.executable, "-c", NOTHING], Home(folder / "nothing"), seconds)
+        results["nothing"] = measure([sys.executable, "-c", NOTHING], Home(folder / "nothing"), times)
         show("nothing", results["nothing"])
     grown = growth(1000 if options.quick else options.frames)
     print(
