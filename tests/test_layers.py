@@ -68,6 +68,7 @@ GROUND = {
     "jsonl",
     "poses",
     "highpass",
+    "memory",
 }
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
@@ -81,7 +82,6 @@ ABOVE = {
     "sightings": GROUND,
     "fusion": GROUND | {"stages"},
     "notify": set(),
-    "memory": set(),
     "mavproxy_locagen": GROUND | {"mavlink"},  # loaded by MAVProxy alone
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},
