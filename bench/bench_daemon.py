@@ -175,17 +175,21 @@ class Heard:
 
 
 def ours(datagrams: list[tuple[int, bytes]], frame_s: float) -> Heard:
-    """Of LOCAGEN_BEARING: its time is that of the sound's middle."""
-    framer, delays, first = Framer(), {}, None
+    """Of each bearing, whose first datagram is the value LG_AZB; the record behind it, LOCAGEN_BEARING, has the
+    time of the sound's middle."""
+    framer, delays, first, begun = Framer(), {}, None, None
     for stamp_ns, data in datagrams:
         for packet in framer.feed(data):
+            if packet.message_id == dialect.NAMED_VALUE_FLOAT:
+                begun = begun or stamp_ns
             if packet.message_id != dialect.LOCAGEN_BEARING:
                 continue
             message = dialect.decode(packet.raw)
-            if message.event_id > 0:
-                first = first or stamp_ns
-            # the first time that this frame is told of: the same may be said again
-            delays.setdefault(message.time_usec, (stamp_ns * 1e-3 - message.time_usec) * 1e-6 - frame_s / 2)
+            if message.event_id > 0 and begun is not None:
+                first = first or begun
+                # the first time that this frame is told of: the same may be said again
+                delays.setdefault(message.time_usec, (begun * 1e-3 - message.time_usec) * 1e-6 - frame_s / 2)
+            begun = None
     return Heard(list(delays.values()), first)
 
 

@@ -205,7 +205,7 @@ def _against(off: F64, variance: F64, more: float) -> tuple[float, float]:
     (a, b), (_, d) = variance.tolist()
     a, d = a + more, d + more
     x, y = off.tolist()
-    determinant = a * d - b * b
+    determinant = max(a * d - b * b, 1e-300)  # above zero but for rounding
     return (d * x * x - 2.0 * b * x * y + a * y * y) / determinant, determinant
 
 
