@@ -96,7 +96,7 @@ class Times:
     """how often it is started to be listened to"""
 
 
-FULL, QUICK = Times(5.0, 60.0, 6.0, 12.0, 5), Times(1.5, 1.0, 2.5, 3.5, 1)
+FULL, QUICK = Times(5.0, 45.0, 6.0, 10.0, 4), Times(1.5, 1.0, 2.5, 3.5, 1)
 
 
 # --- the scene ----------------------------------------------------------------------------------------
@@ -175,8 +175,8 @@ class Heard:
 
 
 def ours(datagrams: list[tuple[int, bytes]], frame_s: float) -> Heard:
-    """Of each bearing, whose first datagram is the value LG_AZB; the record behind it, LOCAGEN_BEARING, has the
-    time of the sound's middle."""
+    """Of each bearing, whose first datagram is the value LG_AZB; the record behind it, LOCAGEN_BEARING, has
+    the time of the sound's middle."""
     framer, delays, first, begun = Framer(), {}, None, None
     for stamp_ns, data in datagrams:
         for packet in framer.feed(data):
