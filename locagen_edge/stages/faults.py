@@ -62,6 +62,11 @@ class DelayFit:
         return math.sqrt(float(off @ off) / spare)
 
 
+def strong(tdoa: Tdoa) -> bool:
+    """Whether the delays are certain enough to accuse the array."""
+    return bool(sorted(tdoa.peak.tolist())[len(tdoa.peak) // 2] > STRONG_PEAK)
+
+
 def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, misfit: float) -> set[str]:
     """What is wrong in this frame alone, in words; microphones counted from 0 as in the settings."""
     samples = frame.samples
@@ -76,21 +81,25 @@ def symptoms(frame: Frame, correlation: Correlation, tdoa: Tdoa, misfit: float) 
     dead = {m for m in mics if power[m] < quiet} - broken
     found |= {f"microphone {m}: dead, hears nothing" for m in dead}
     magnitude = np.abs(samples)
-    clipped = np.mean(magnitude >= FULL_SCALE, axis=1)
-    offset = np.abs(samples.mean(axis=1))
+    at = magnitude.argmax(axis=1).tolist()
+    peak = [float(magnitude[m, at[m]]) for m in mics]
     for m in mics:
         if m in broken:
             continue
-        if clipped[m] > CLIPPED_SHARE:
+        if peak[m] >= FULL_SCALE and np.mean(magnitude[m] >= FULL_SCALE) > CLIPPED_SHARE:
             found.add(f"microphone {m}: clipped, the gain is too high")
-        if offset[m] > OFFSET:
+        if peak[m] > OFFSET and abs(samples[m].mean()) > OFFSET:
             found.add(f"microphone {m}: a constant offset, over a tenth of full scale")
     live = [m for m in mics if m not in dead | broken]
     for k, i in enumerate(live):
         for j in live[k + 1 :]:
-            if np.abs(samples[i] - samples[j]).max() <= SAME * magnitude[i].max():
+            limit = SAME * peak[i]
+            # where one is loudest the other differs, unless they are one signal: the rest is seldom looked at
+            if abs(samples[i, at[i]] - samples[j, at[i]]) > limit:
+                continue
+            if np.abs(samples[i] - samples[j]).max() <= limit:
                 found.add(f"microphones {i} and {j}: the same signal twice, check audio.channel_map")
-    if not dead and not broken and np.sort(tdoa.peak)[len(tdoa.peak) // 2] > STRONG_PEAK and misfit > MISFIT:
+    if not dead and not broken and misfit > MISFIT and strong(tdoa):
         found.add("the delays fit no direction: channels swapped, or array.positions_m is wrong")
     return found
 
@@ -111,7 +120,7 @@ class FaultFinder:
         self, frame: Frame, correlation: Correlation, tdoa: Tdoa, elapsed_s: float
     ) -> tuple[str, ...]:
         """`elapsed_s`: since the previous frame."""
-        now = symptoms(frame, correlation, tdoa, self._fit.misfit(tdoa))
+        now = symptoms(frame, correlation, tdoa, self._fit.misfit(tdoa) if strong(tdoa) else 0.0)
         keep = math.exp(-elapsed_s / MEMORY_S)
         for text in now | self._share.keys():
             share = keep * self._share.get(text, 0.0) + (1.0 - keep) * (text in now)
