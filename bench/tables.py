@@ -131,31 +131,31 @@ def draw(cells: Cells) -> None:
 PAGE = """\
 # Accuracy and detection, measured
 
-Written by `bench/tables.py` from `bench/results/`; to measure anew: `make bench`. Three microphones 10 cm apart,
-10 kHz; {trials} trials a cell; {cpu}, {date}, commits {commits}.
+Written by `bench/tables.py` from `bench/results/`; to measure anew: `make bench`. Three microphones 10 cm
+apart, 10 kHz; {trials} trials a cell; {cpu}, {date}, commits {commits}.
 
 ![Mean error beside the bound](accuracy.png)
 
 ## One frame in plain noise
 
-Mean |azimuth error| over the Cramer-Rao bound; frames of 0.1 s, noise of each microphone's own, SNR over 0 to
-5 kHz, a caller on the horizon. `steered` answers always here, as the peers do; for this project's other
+Mean |azimuth error| over the Cramer-Rao bound; frames of 0.1 s, noise of each microphone's own, SNR over 0
+to 5 kHz, a caller on the horizon. `steered` answers always here, as the peers do; for this project's other
 estimators "no bearing" counts as 90 degrees.
 
 {plain}
 ## Under rotors
 
-Median |azimuth error| and the share beyond 15 degrees; in-band SNR (300 to 4700 Hz). `steered` answers always, by
-the frame or, where a call of 1 s is judged, by its average of 0.8 s; `steered, told` is what the pipeline says
-(after a second its track, if it has one), where "no bearing" counts as 90 degrees. *Hunting*: every rotor's
-speed goes up and down by 10 % a second. *Recorded*: propellers on a flying frame, with the frame's own
-microphones, of which three are used.
+Median |azimuth error| and the share beyond 15 degrees; in-band SNR (300 to 4700 Hz). `steered` answers
+always, by the frame or, where a call of 1 s is judged, by its average of 0.8 s; `steered, told` is what the
+pipeline says (after a second its track, if it has one), where "no bearing" counts as 90 degrees. *Hunting*:
+every rotor's speed goes up and down by 10 % a second. *Recorded*: propellers on a flying frame, with the
+frame's own microphones, of which three are used.
 
 {rotors}
 ## False calls, and calls found
 
-The pipeline as it flies, with its defaults; calls of one second from anywhere below after 14 s of noise; in-band
-SNR while it calls. What is not found at all is left out of the second table.
+The pipeline as it flies, with its defaults; calls of one second from anywhere below after 14 s of noise;
+in-band SNR while it calls. What is not found at all is left out of the second table.
 
 {detection}"""
 
