@@ -40,6 +40,7 @@ from locagen_edge.types import Estimate, Frame, Position, Track
 if TYPE_CHECKING:
     from locagen_edge.daemon import Daemon
     from locagen_edge.export import Callers, Event
+    from locagen_edge.framing import Losses
     from locagen_edge.jsonl import Record
     from locagen_edge.mavlink.links import Links
     from locagen_edge.store.recorder import Progress, Recorder
@@ -376,7 +377,7 @@ async def _serve(
     if not quiet:
         c = daemon.counters
         print(
-            f"{c.estimates} frames, {c.dropped} dropped, {c.overruns} overruns, "
+            f"{c.estimates} frames, {c.dropped} dropped, {c.sound}, "
             f"{c.source_failures} source failures; sent {_counts(daemon.component.sent)}, "
             f"{daemon.links.dropped} of them lost"
         )
@@ -643,7 +644,7 @@ def _record(arguments: argparse.Namespace) -> int:
     directory = arguments.output or Path(settings.record.directory)
     recorder = Recorder(directory, settings)
     try:
-        overruns = asyncio.run(_keep(settings, recorder, arguments.seconds))
+        losses = asyncio.run(_keep(settings, recorder, arguments.seconds))
     finally:
         if sys.stderr.isatty():
             print(file=sys.stderr)
@@ -652,14 +653,15 @@ def _record(arguments: argparse.Namespace) -> int:
         raise StorageError(recorder.failure)
     done = recorder.progress()
     print(
-        f"{done.seconds:.1f} s in {directory}, {overruns} overruns, {done.lost} blocks lost; "
+        f"{done.seconds:.1f} s in {directory}, {losses}, {done.lost} blocks not written; "
         f"hear it with: locagen-edge replay {directory}"
     )
     return 0
 
 
-async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -> int:
-    """Reads the source, which fills the recorder, until the time is over or a signal comes. Overruns."""
+async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -> Losses:
+    """Reads the source, which fills the recorder, until the time is over or a signal comes."""
+    from locagen_edge.framing import Losses
     from locagen_edge.sources import open_source
 
     stopping = asyncio.Event()
@@ -667,7 +669,7 @@ async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopping.set)
     stop = asyncio.create_task(stopping.wait())
-    overruns, second = 0, 0
+    losses, second = Losses(), 0
     async with contextlib.aclosing(open_source(settings, recorder)) as source:
         while not recorder.failure:
             coming = asyncio.ensure_future(anext(source, None))
@@ -679,18 +681,18 @@ async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -
             frame = coming.result()
             if frame is None:  # a recording's end
                 break
-            overruns += frame.overruns
+            losses.count(frame)
             heard_s = (frame.start + frame.samples.shape[1]) / frame.rate_hz
             if seconds is not None and heard_s >= seconds:
                 break
             if int(heard_s) > second:
                 second = int(heard_s)
-                _show(recorder.progress(), overruns)
+                _show(recorder.progress(), losses)
     stop.cancel()
-    return overruns
+    return losses
 
 
-def _show(progress: Progress, overruns: int) -> None:
+def _show(progress: Progress, losses: Losses) -> None:
     """One line that is written over, on a terminal: what there is, and the level of each channel."""
     if not sys.stderr.isatty():
         return
@@ -698,7 +700,7 @@ def _show(progress: Progress, overruns: int) -> None:
     peak = _dbfs(max(progress.peak, default=0.0))
     text = (
         f"{progress.seconds:7.0f} s  {progress.name}  {progress.kept_bytes / 1e6:.1f} MB  "
-        f"rms {levels} dBFS, peak {peak:.0f}  {overruns} overruns, {progress.lost} lost"
+        f"rms {levels} dBFS, peak {peak:.0f}  {losses}, {progress.lost} blocks not written"
     )
     print(f"\r{text[: shutil.get_terminal_size().columns - 1]}\033[K", end="", file=sys.stderr, flush=True)
 
@@ -776,7 +778,8 @@ def _devices(_: argparse.Namespace) -> int:
         print("no capture device: plug one in, and see `arecord -l` for what the kernel knows")
     for device in found:
         rate = f"default {device.default_rate_hz:g} Hz"
-        print(f"{device.name!r}: {device.channels} channels, {rate} ({device.host_api})")
+        stable = f", audio.device = {device.stable_name!r}" if device.stable_name != device.name else ""
+        print(f"{device.name!r}: {device.channels} channels, {rate} ({device.host_api}){stable}")
     return 0
 
 
