@@ -26,6 +26,10 @@ Finding = tuple[bool, str, str]
 LEAST_S = 1.0
 """A fault has to last for most of a second before it counts as one."""
 
+NOT_JUDGED = (
+    "no sound was common to all microphones: order, sign and spacing are not judged; "
+    "clap or talk while this runs"
+)
 FASTEST_PPM = 500.0
 """Crystals err by 100 ppm at most; a device that misses its rate by more is not of the rate it says."""
 WRONG_CLOCK = ": no crystal errs so much; does it resample, or lose sound?"
@@ -106,6 +110,8 @@ async def _listen(settings: Settings, pipeline: Pipeline, seconds: float) -> lis
     except LocagenError as error:
         return [(False, "microphones", str(error))]
     found = [(False, "microphones", fault) for fault in sorted(faults)]
+    if frames and not pipeline.channels_judged:
+        found.append((True, "channels", NOT_JUDGED))
     if losses.overruns:
         found.append((False, "sound", f"{losses}: is the machine overloaded?"))
     drift = losses.drift

@@ -50,6 +50,11 @@ class Pipeline:
         )
         self._last_ns: int | None = None
 
+    @property
+    def channels_judged(self) -> bool:
+        """Whether there has been a sound from which faults between channels can be told."""
+        return self._find_faults.judged
+
     def apply(self, settings: Settings) -> None:
         """New settings from the next frame on: call it between two frames.
 

@@ -439,4 +439,4 @@ def test_a_converter_at_its_end_is_seen_before_filters_round_it_off(tmp_path, ga
     sound[:, 1] = np.clip(5 * sound[:, 1], -1, 1)
     soundfile.write(path, sound, 48_000)
     settings = from_table({"array": {"gains_db": [0.0, gain_db, 0.0]}})
-    assert {frame.clipped for frame in wav_frames(path, settings)} == {0b010}
+    assert next(iter(wav_frames(path, settings))).clipped == 0b010
