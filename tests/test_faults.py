@@ -93,7 +93,7 @@ def test_an_array_larger_than_it_says_is_told_from_any_side(azimuth):
     real = made()
     believed = made([[x / 2 for x in row] for row in real.array.positions_m])
     told = faults(believed, heard(real, azimuth, -0.2, 15.0, 30_000))
-    assert told == ("delays longer than array.positions_m allows: wrong places, or a wrong device rate",)
+    assert told == ("delays longer than array.positions_m allows: channels swapped, wrong places or rate",)
 
 
 def test_a_device_of_another_rate_stretches_delays_and_is_told():
@@ -101,7 +101,7 @@ def test_a_device_of_another_rate_stretches_delays_and_is_told():
     settings = made()
     fast = made(audio={"rate_hz": 20_000})
     samples = heard(fast, 0.5, 0.0, 20.0, 60_000)
-    assert any("wrong device rate" in text for text in faults(settings, samples))
+    assert any("wrong places or rate" in text for text in faults(settings, samples))
 
 
 def test_a_microphone_that_hears_another_world_is_named():

@@ -166,7 +166,7 @@ def between(pairs: tuple[tuple[int, int], ...], verdicts: list[str | None], mics
         elif fine and all(v == "" for v in of[m]):
             found.add(f"microphone {m}: hears nothing of what the others hear")
     if not found and BEYOND in verdicts:
-        found.add("delays longer than array.positions_m allows: wrong places, or a wrong device rate")
+        found.add("delays longer than array.positions_m allows: channels swapped, wrong places or rate")
     if not found and UPSIDE_DOWN in verdicts:
         i, j = pairs[verdicts.index(UPSIDE_DOWN)]
         found.add(f"microphones {i} and {j}: one is inverted, its two wires are swapped")
