@@ -63,6 +63,7 @@ GROUND = {
     "models",
     "framing",
     "resampling",
+    "sampleclock",
     "alignment",
     "files",
     "jsonl",
