@@ -24,7 +24,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from locagen_edge import __version__
+from locagen_edge import __version__, stopping
 from locagen_edge.errors import (
     CalibrationError,
     ExportError,
@@ -60,6 +60,8 @@ def main(argv: list[str] | None = None) -> None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal without a degree sign is no reason to stop
+    if arguments.command not in (_run, _record):  # these two run until they are stopped
+        stopping.with_code(128 + signal.SIGTERM)
     try:
         code = arguments.command(arguments)
     except SourceHungError as error:
@@ -356,8 +358,7 @@ async def _serve(
         return open_source(settings, recorder)
 
     daemon = Daemon(settings, on_second=each_second, on_estimate=each_estimate, sources=source)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, daemon.stop)
+    stopping.calls(daemon.stop)
     if not quiet:
         links = ", ".join(settings.mavlink.link)
         print(
@@ -664,11 +665,9 @@ async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -
     from locagen_edge.framing import Losses
     from locagen_edge.sources import open_source
 
-    stopping = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stopping.set)
-    stop = asyncio.create_task(stopping.wait())
+    enough = asyncio.Event()
+    stopping.calls(enough.set)
+    stop = asyncio.create_task(enough.wait())
     losses, second = Losses(), 0
     async with contextlib.aclosing(open_source(settings, recorder)) as source:
         while not recorder.failure:

@@ -82,6 +82,7 @@ ABOVE = {
     "sightings": GROUND | {"export"},
     "fusion": GROUND | {"stages"},
     "notify": set(),
+    "stopping": set(),
     "mavproxy_locagen": GROUND | {"mavlink"},  # loaded by MAVProxy alone
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},

@@ -43,6 +43,7 @@ log = logging.getLogger(__name__)
 POLL_S = 0.02  # 50 wake-ups a second; less than half the default hop
 LATENCY_S = 0.4  # the card's buffer: what may pile up while this process does not get to run; delays nothing
 CARDS = Path("/proc/asound")  # where the kernel tells its cards' ids
+TURN_S = 0.5  # what one turn of waiting counts at most: a process that was suspended has not waited
 OPEN_S = 10.0  # PortAudio asks every card at its start: about a second on a small board
 CLOSE_S = 0.5  # of the second in which the service must end
 
@@ -157,8 +158,7 @@ async def alsa(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Fra
     try:
         while True:
             try:
-                async with asyncio.timeout(patience_s):
-                    frame = await box.get()
+                frame = await _patiently(box, patience_s)
             except TimeoutError:
                 raise SourceHungError(f"{_label(settings)}: the driver hangs: restart the service") from None
             # The thread reports a stall itself, after stall_s; later than that it is stuck.
@@ -172,6 +172,16 @@ async def alsa(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Fra
         except TimeoutError:
             _hung = thread
             log.error("%s: the driver does not let go", _label(settings))
+
+
+async def _patiently(box: _Mailbox, patience_s: float) -> Frame:
+    """The next frame. Raises `TimeoutError` after so long; time in which this process stood still is none."""
+    turns = max(round(patience_s / TURN_S), 1)
+    for _ in range(turns):
+        with suppress(TimeoutError):
+            async with asyncio.timeout(patience_s / turns):
+                return await box.get()
+    raise TimeoutError
 
 
 def _label(settings: Settings) -> str:
@@ -262,15 +272,17 @@ def capture(
     cutter = _Cutter(settings, rate_hz, tap)
     clock = SampleClock(rate_hz)
     samples = 0
-    heard_ns = now_ns()
+    quiet_ns = 0
+    asked_ns = now_ns()
     while not wait(POLL_S):
-        asked_ns = now_ns()
+        before_ns, asked_ns = asked_ns, now_ns()
         waiting = stream.read_available
         if not waiting:
-            if asked_ns - heard_ns > settings.daemon.stall_s * 1e9:
+            quiet_ns += min(asked_ns - before_ns, round(TURN_S * 1e9))
+            if quiet_ns > settings.daemon.stall_s * 1e9:
                 raise SourceError(f"{_label(settings)}: no sound for {settings.daemon.stall_s:g} s")
             continue
-        heard_ns = asked_ns
+        quiet_ns = 0
         rows, overflowed = stream.read(waiting)
         if rows.dtype == np.int32:
             rows = rows * np.float32(2.0**-31)  # exact for 24 bits, and below a 32-bit converter's noise
