@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from alsa.card import VirtualCard, build
+from alsa.card import VirtualCard
 from conftest import ROOT
 from test_daemon import running, source, until, with_link
 
@@ -104,11 +104,6 @@ def test_what_is_asked_for_and_not_done_is_no_success(tmp_path):
 
 
 # --- suspended
-
-
-@pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("plugin"))
 
 
 def test_what_a_suspended_process_missed_is_a_gap_counted_and_told(library, tmp_path):

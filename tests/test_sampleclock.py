@@ -1,14 +1,18 @@
 """The clock of a sound card: followed, measured, and never mistaken for a loss."""
 
+import asyncio
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
+from locagen_edge import check
 from locagen_edge.framing import Losses
 from locagen_edge.sampleclock import CERTAIN_S, LOSS_POLLS, SampleClock
-from locagen_edge.types import Drift, Frame
+from locagen_edge.settings import from_table
+from locagen_edge.types import Detection, Drift, Estimate, Frame
 
 RATE = 48_000
 POLL_NS = 20_000_000
@@ -104,3 +108,31 @@ def test_a_source_that_begins_has_lost_nothing():
     losses.reopened()
     losses.count(frame(1e6))
     assert str(losses) == "0 overruns, 0.0 s of sound lost"
+
+
+@pytest.mark.parametrize(("ppm", "good"), [(80.0, True), (-88_435.0, False)])
+def test_check_knows_a_clock_that_is_no_crystals(monkeypatch, ppm, good):
+    """A device that says 48 kHz and gives 44.1."""
+
+    async def frames(_):
+        for k in range(100):
+            yield frame(k * 0.05, drift=Drift(ppm, 20.0))
+            await asyncio.sleep(0.01)
+
+    monkeypatch.setattr("locagen_edge.check.open_source", frames)
+    settings = from_table({"audio": {"source": "alsa", "frame": 1024}, "bearing": {"estimator": "far-field"}})
+    found = asyncio.run(check._listen(settings, Processed(), 0.2))
+    (told,) = [(fine, text) for fine, what, text in found if what == "clock"]
+    assert told[0] == good
+    assert ("no crystal errs so much" in told[1]) != good
+
+
+class Processed:
+    """Stands for a pipeline."""
+
+    channels_judged = True
+
+    def process(self, frame):
+        return Estimate(
+            frame.t_ns, 0, 0, None, None, Detection(False, 0.0, -60.0), None, (), None, (), None, (), ()
+        )

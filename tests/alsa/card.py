@@ -109,3 +109,18 @@ class VirtualCard:
         )  # fmt: skip
         assert child.returncode == 0, child.stderr
         return json.loads(child.stdout)
+
+
+MAP = (2, 0, 3)
+
+
+def rows_of(frame: dict, channels: tuple[int, ...] = MAP) -> np.ndarray:
+    """(n,) row numbers, which must agree between the microphones."""
+    rows = np.stack([row_of(s, channel) for s, channel in zip(frame["samples"], channels, strict=True)])
+    assert (rows == rows[0]).all()
+    return rows[0]
+
+
+def assert_whole(frame: dict) -> None:
+    """Every row once and in order."""
+    assert (np.diff(rows_of(frame)) % ROWS == 1).all()
