@@ -165,6 +165,11 @@ def _parser() -> argparse.ArgumentParser:
         "--output", type=Path, metavar="DIR", help="where the parts go (default: record.directory)"
     )
     record.add_argument("--seconds", type=_positive, metavar="N", help="stop after N seconds of sound")
+    record.add_argument(
+        "--poses",
+        action="store_true",
+        help="keep the vehicle's poses too, from mavlink.link: not while `run` has that link",
+    )
 
     log = command(
         "log",
@@ -645,7 +650,7 @@ def _record(arguments: argparse.Namespace) -> int:
     directory = arguments.output or Path(settings.record.directory)
     recorder = Recorder(directory, settings)
     try:
-        losses = asyncio.run(_keep(settings, recorder, arguments.seconds))
+        losses = asyncio.run(_keep(settings, recorder, arguments.seconds, poses=arguments.poses))
     finally:
         if sys.stderr.isatty():
             print(file=sys.stderr)
@@ -660,16 +665,20 @@ def _record(arguments: argparse.Namespace) -> int:
     return 0
 
 
-async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -> Losses:
+async def _keep(settings: Settings, recorder: Recorder, seconds: float | None, *, poses: bool) -> Losses:
     """Reads the source, which fills the recorder, until the time is over or a signal comes."""
     from locagen_edge.framing import Losses
+    from locagen_edge.mavlink.posefeed import posefeed
+    from locagen_edge.poses import record_of
     from locagen_edge.sources import open_source
 
     enough = asyncio.Event()
     stopping.calls(enough.set)
     stop = asyncio.create_task(enough.wait())
     losses, second = Losses(), 0
-    async with contextlib.aclosing(open_source(settings, recorder)) as source:
+    async with contextlib.AsyncExitStack() as ending:
+        known = await ending.enter_async_context(posefeed(settings)) if poses else None
+        source = await ending.enter_async_context(contextlib.aclosing(open_source(settings, recorder)))
         while not recorder.failure:
             coming = asyncio.ensure_future(anext(source, None))
             await asyncio.wait([coming, stop], return_when=asyncio.FIRST_COMPLETED)
@@ -681,6 +690,9 @@ async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -
             if frame is None:  # a recording's end
                 break
             losses.count(frame)
+            pose = known.at(frame.middle_ns) if known is not None else None
+            if pose is not None:
+                recorder.note(record_of(pose))
             heard_s = (frame.start + frame.samples.shape[1]) / frame.rate_hz
             if seconds is not None and heard_s >= seconds:
                 break
