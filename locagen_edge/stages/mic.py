@@ -284,8 +284,8 @@ def capture(
             continue
         quiet_ns = 0
         rows, overflowed = stream.read(waiting)
-        if rows.dtype == np.int32:
-            rows = rows * np.float32(2.0**-31)  # exact for 24 bits, and below a 32-bit converter's noise
+        if rows.dtype == np.int32:  # exact for 24 bits, and below a 32-bit converter's noise
+            rows = rows.astype(np.float32) * np.float32(2.0**-31)
         if overflowed or not clock.update(samples + waiting, asked_ns):
             cutter.gap()
             clock = SampleClock(rate_hz, clock.drift)
