@@ -44,7 +44,7 @@ async def closing_s(source):
 async def listen(settings, control):
     before_ns = time.monotonic_ns()
     source = open_source(settings)
-    frames = await take(source, 12)
+    frames = await take(source, 6)
     after_ns = time.monotonic_ns()
     seconds = await closing_s(source)
     return {
