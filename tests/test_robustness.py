@@ -53,7 +53,7 @@ def obeys(process: subprocess.Popen[str]) -> bool:
 def settings_file(tmp_path) -> Path:
     path = tmp_path / "s.toml"
     path.write_text(
-        f'[mavlink]\nlink = "udpout:127.0.0.1:9"\nsigning_state = "{tmp_path}/state"\n'
+        f'[mavlink]\nlink = "udpout:127.0.0.1:9"\nstate_directory = "{tmp_path}/state"\n'
         f'[log]\ndirectory = "{tmp_path}/log"\n[record]\nfree_mb = 0\nsync_s = 0.1\n'
     )
     return path
