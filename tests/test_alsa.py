@@ -153,7 +153,7 @@ def test_a_live_run_from_a_card_of_24_bits_replays_bit_for_bit(library, tmp_path
     path.write_text(
         '[audio]\nsource = "alsa"\ndevice = "array4"\ndevice_channels = 4\nsample_format = "int24"\n'
         'channel_map = [0, 2, 3]\n[bearing]\nestimator = "far-field"\n[detection]\nsnr_db = -20\n'
-        '[mavlink]\nlink = "udpout:127.0.0.1:9"\n[record]\nfree_mb = 0\n'
+        '[mavlink]\nlink = "udpout:127.0.0.1:9"\n[record]\nfree_mb = 0\n[daemon]\nqueue_frames = 1000\n'
         f'[log]\ndirectory = "{tmp_path}/log"\n'
     )
     command = ["run", "--quiet", "--seconds", "4", "--settings", path, "--record", tmp_path / "parts"]
