@@ -15,7 +15,6 @@ import math
 import os
 import shutil
 import signal
-import statistics
 import sys
 import time
 from collections import Counter, deque
@@ -34,6 +33,7 @@ from locagen_edge.errors import (
     StorageError,
 )
 from locagen_edge.geometry import compass_deg
+from locagen_edge.memory import one_arena
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
 from locagen_edge.types import Estimate, Frame, Position, Track
 
@@ -308,6 +308,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    one_arena()
     settings = _settings(arguments)
     callers, recorder = _callers(arguments), None
     with contextlib.ExitStack() as ending:
@@ -447,7 +448,7 @@ class LiveLine:
         else:
             parts.append(describe(daemon.estimate))
             if latency:
-                parts.append(f"{1e3 * statistics.median(latency):.1f} ms")
+                parts.append(f"{1e3 * sorted(latency)[len(latency) // 2]:.1f} ms")
         parts.append(self._links(daemon.links, news))
         print("  ".join(parts), flush=True)
 

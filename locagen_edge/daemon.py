@@ -102,6 +102,7 @@ class Daemon:
         self._told: BaseException | None = None
         self._links_up = 0
         self._said_s = -math.inf
+        self._sent_s = -math.inf
         self._save_s = math.inf
         self._told_losses = 0, 0
         self._tell_losses_s = -math.inf
@@ -258,14 +259,14 @@ class Daemon:
             estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
             self.estimate, self._middle_ns = estimate, frame.middle_ns
             self._working = False
+            self._heard_s = time.monotonic()
+            self.counters.estimates += 1
+            self.counters.latency_s.append((time.monotonic_ns() - frame.end_ns) * 1e-9)
+            self._send()  # first: all else can wait
             if self.black_box is not None:
                 self.black_box.hear(frame, estimate)
             if self._on_estimate is not None:
                 self._on_estimate(frame, estimate)
-            self._heard_s = time.monotonic()
-            self.counters.estimates += 1
-            self.counters.latency_s.append((time.monotonic_ns() - frame.end_ns) * 1e-9)
-            self._send()
             self._tell_ready()
 
     # --- what is asked over MAVLink: none of it waits
@@ -333,6 +334,7 @@ class Daemon:
     def _send(self) -> None:
         """Sends what is due. While the link is down nothing is: it would be said to nobody."""
         up, now_s = self.links.up, time.monotonic()
+        self._sent_s = now_s
         # Who has just come up has heard nothing; but one that flaps must not make all others hear it again.
         if up > self._links_up and (not self._links_up or now_s - self._said_s > SAY_AGAIN_S):
             self.component.say_again()
@@ -382,7 +384,8 @@ class Daemon:
         next_s = time.monotonic() + 1.0
         while True:
             await asyncio.sleep(TICK_S)
-            self._send()
+            if time.monotonic() - self._sent_s > TICK_S / 2.0:  # each frame sends what is due, too
+                self._send()
             for number in range(len(self.links.links)):
                 self._answer(number)
             if time.monotonic() < next_s:

@@ -69,6 +69,7 @@ GROUND = {
     "jsonl",
     "poses",
     "highpass",
+    "memory",
 }
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
@@ -78,8 +79,8 @@ ABOVE = {
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
     "store": GROUND | {"sightings"},
-    "export": GROUND,
-    "sightings": GROUND | {"export"},
+    "export": GROUND | {"sightings"},
+    "sightings": GROUND,
     "fusion": GROUND | {"stages"},
     "notify": set(),
     "stopping": set(),

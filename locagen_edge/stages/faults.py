@@ -190,14 +190,15 @@ def alone(frame: Frame, correlation: Correlation) -> tuple[set[str], set[int]]:
     quiet = max(loudest * 10 ** (DEAD_DB / 10), SILENCE)
     dead = {m for m in mics if power[m] < quiet} - broken
     found |= {f"microphone {m}: dead, hears nothing" for m in dead}
-    clipped = np.mean(np.abs(samples) >= FULL_SCALE, axis=1)
-    offset = np.abs(samples.mean(axis=1))
+    magnitude = np.abs(samples)
+    peak = magnitude.max(axis=1).tolist()
     for m in mics:
         if m in broken:
             continue
-        if clipped[m] > CLIPPED_SHARE or frame.clipped >> m & 1:
+        at_the_end = peak[m] >= FULL_SCALE and np.mean(magnitude[m] >= FULL_SCALE) > CLIPPED_SHARE
+        if at_the_end or frame.clipped >> m & 1:
             found.add(f"microphone {m}: clipped, the gain is too high")
-        if offset[m] > OFFSET:
+        if peak[m] > OFFSET and abs(samples[m].mean()) > OFFSET:
             found.add(f"microphone {m}: a constant offset, over a tenth of full scale")
     live = sorted(set(mics) - dead - broken)
     for k, i in enumerate(live):
