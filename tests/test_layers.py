@@ -63,6 +63,7 @@ GROUND = {
     "models",
     "framing",
     "resampling",
+    "sampleclock",
     "alignment",
     "files",
     "jsonl",
@@ -82,6 +83,7 @@ ABOVE = {
     "sightings": GROUND,
     "fusion": GROUND | {"stages"},
     "notify": set(),
+    "stopping": set(),
     "mavproxy_locagen": GROUND | {"mavlink"},  # loaded by MAVProxy alone
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},
