@@ -47,9 +47,12 @@ FLAT = 0.93
 """Least score over the best from which all directions are alike: noise far louder than what was learnt."""
 SILENCE = 1e-11
 """-110 dBFS mean square in the band: a muted input teaches nothing."""
-RIVAL = 0.95
-"""Score of another lobe over the best from which nobody knows which is true: 0.96 and more for a whistle of
-3 kHz, whose wavelength is shorter than twice the array; under 0.7 for voices."""
+RIVAL = 0.97
+"""Score of another lobe over the best from which nobody knows which is true, however loud the caller: the
+microphones stand where they should to within their tolerance only."""
+CLOSER = 1.5
+"""Roots of the score by which the best lobe has to be ahead of any other: chance gives as much. A whistle of
+3 kHz, whose wavelength is shorter than twice the array, has lobes that are nearly alike; a voice has one."""
 SECOND = 0.2
 """Least score of a second caller beside the first one's, who has to be a call by himself too: below it lies
 what a null leaves of the first."""
@@ -214,7 +217,7 @@ class SteeredLocator:
         self._search.weigh(self._weights[span])
         placed = self._sources(span)
         self._search.weigh(np.ones_like(self._weights[span]))
-        too_little = len(placed) < len(found) or placed[0].rival > RIVAL
+        too_little = len(placed) < len(found) or _may_be_elsewhere(placed[0])
         return found if too_little else list(placed[: len(found)])
 
     def _nearest(self, source: Source) -> int:
@@ -222,7 +225,7 @@ class SteeredLocator:
         return int(np.argmax(self._grid_u @ direction(source.azimuth_rad, source.elevation_rad)))
 
     def _told(self, source: Source, span: int, evidence: Evidence) -> Bearing:
-        if source.rival > RIVAL:
+        if _may_be_elsewhere(source):
             return no_bearing(NAME, evidence)
         return self._placed_at(source, span, evidence)
 
@@ -304,3 +307,8 @@ class SteeredLocator:
             usual.learn(score, self._elapsed_s)
         if not self._usual[0].young and max(self._since_lag) < self._least_ratio:
             self._onsets.learn(self._lag, self._elapsed_s)
+
+
+def _may_be_elsewhere(source: Source) -> bool:
+    """Whether another lobe explains what was heard nearly as well."""
+    return source.rival > min(RIVAL, 1.0 - CLOSER / math.sqrt(max(source.score, 1.0)))
