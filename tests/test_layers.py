@@ -76,6 +76,8 @@ ABOVE = {
     "mavlink": GROUND,
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
+    "restarts": set(),
+    "journald": set(),
     "store": GROUND | {"sightings"},
     "export": GROUND,
     "sightings": GROUND | {"export"},
