@@ -3,9 +3,11 @@
     python deb/build.py [--architecture arm64] [--output build/deb]
 
 What Debian does not have as we need it lies in a virtual environment of its own, /opt/locagen-edge, and
-nothing else on the machine is touched: /opt is where the Filesystem Hierarchy Standard (3.0, section 3.13) puts
-software from elsewhere, and where `make install` puts it too, so that there is one unit. Of Debian come Python
-and PortAudio. The package is for the Python it is made with: 3.11 for Debian 12.
+nothing else on the machine is touched: /opt is where the Filesystem Hierarchy Standard (3.0, 3.13) puts
+software from elsewhere, and where `make install` puts it too, so that there is one unit. Python and PortAudio
+are Debian's. The package is for the Python it is made with: 3.11 for Debian 12.
+
+No udev rule is needed: cards belong to `audio` and serial ports to `dialout`, and the user is in both.
 
 No part of it is run while it is made, so a package for the Raspberry Pi is made on any PC: wheels of others
 come from PyPI for that architecture, in the versions of constraints.txt; our own is cross-compiled. Times are
