@@ -175,7 +175,7 @@ install: ## as root: program, unit, user and sample settings; DESTDIR is honoure
 	install -d $(DESTDIR)$(LIB_DIR) $(DESTDIR)$(ETC_DIR) $(DESTDIR)$(SYSTEMD_DIR) $(DESTDIR)$(SYSUSERS_DIR)
 	$(PYTHON) -m venv $(DESTDIR)$(LIB_DIR)
 	@# built from a copy: root leaves nothing behind in the checkout
-	@copy=$$(mktemp -d) && cp -r csrc locagen_edge models pyproject.toml setup.py MANIFEST.in README.md LICENSE $$copy && \
+	@copy=$$(mktemp -d) && cp -r csrc locagen_edge locagen.py models pyproject.toml setup.py MANIFEST.in README.md LICENSE $$copy && \
 	    rm -f $$copy/locagen_edge/*.so $$copy/locagen_edge/mavlink/_messages.py && $(DESTDIR)$(LIB_DIR)/bin/pip install -q $$copy; ok=$$?; rm -rf $$copy; exit $$ok
 	@# scripts name their interpreter: the place where it will be, not where it is packed
 	@test -z "$(DESTDIR)" || grep -rlI '^#!$(DESTDIR)' $(DESTDIR)$(LIB_DIR)/bin | xargs -r sed -i '1s|^#!$(DESTDIR)|#!|'

@@ -42,14 +42,14 @@ from locagen_edge.types import Estimate, Frame, Position, Track
 
 if TYPE_CHECKING:
     from locagen_edge.daemon import Daemon
-    from locagen_edge.export import Callers, Event
+    from locagen_edge.export import Callers, Told
     from locagen_edge.jsonl import Record
     from locagen_edge.mavlink.links import Links
     from locagen_edge.store.recorder import Progress, Recorder
 
 EXPORT_S = 5.0
 """How often `run --export` writes what is new."""
-EXPORT = "write callers whose place is known to a map file: .geojson, .kml or .gpx says the format"
+EXPORT = "write callers to a map file, their places or bearings: .geojson, .kml or .gpx says the format"
 SERVICE_STATE = Path("/var/lib/locagen-edge")
 TYPES = ("start", "stop", "bearing", "call", "sighting", "fault", "link", "source", "losses", "lost")
 
@@ -431,7 +431,7 @@ def _export(callers: Callers) -> None:
     print(f"locagen-edge: {len(callers.events)} callers in {callers.path}", file=sys.stderr)
 
 
-def _export_or_tell(callers: Callers, events: list[Event]) -> None:
+def _export_or_tell(callers: Callers, events: list[Told]) -> None:
     """From a thread: a disk may take its time, and one that is full is no reason to stop."""
     from locagen_edge.export import export
 
@@ -757,14 +757,14 @@ def _log(arguments: argparse.Namespace) -> int:
 
 
 def _fuse(arguments: argparse.Namespace) -> int:
-    from locagen_edge.export import event, export
+    from locagen_edge.export import event, export, seen_from
     from locagen_edge.fusion import fuse
     from locagen_edge.sightings import read
     from locagen_edge.store.blackbox import sightings
 
     looks = (look for p in arguments.files for look in (sightings(p) if p.is_dir() else read(p)))
     found = fuse(looks, _settings(arguments).position)
-    events = []
+    events: list[Told] = []
     for number, fused in enumerate(found, start=1):
         p = fused.position
         if p.latitude_deg is None or p.longitude_deg is None:
@@ -775,8 +775,8 @@ def _fuse(arguments: argparse.Namespace) -> int:
                 f"{p.latitude_deg:.6f}, {p.longitude_deg:.6f}  1-sigma {p.semi_major_m:.1f} m x "
                 f"{p.semi_minor_m:.1f} m at {math.degrees(p.orientation_rad):.0f}°"
             )
-            told = event(p, p.t_ns, name=f"caller {number}")
-            events += [told] if told is not None else []
+        name = f"caller {number}"
+        events.append(event(p, p.t_ns, name=name) or seen_from(fused.last, name=name))
         seen = ", ".join(f"{observer}/{caller}" for observer, caller in fused.streams)
         print(f"caller {number}: {place}  ({fused.used} looks of {seen}; {fused.unused} not used)")
     if not found:

@@ -30,6 +30,7 @@ from locagen_edge.mavlink.link import parse
 from locagen_edge.mavlink.links import Links
 from locagen_edge.mavlink.parameters import keep, kept, kept_file
 from locagen_edge.mavlink.signing import SAVE_S, guard_of, save_timestamp, state_file
+from locagen_edge.mavlink.twins import Numbers
 from locagen_edge.notify import notify
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings
@@ -109,7 +110,7 @@ class Daemon:
 
     async def startup(self) -> None:
         """Makes pipeline and links. Raises `LocagenError` where the settings cannot be flown with."""
-        guard = guard_of(self.settings)
+        guard, numbers = guard_of(self.settings), Numbers()
         self._save_s = time.monotonic() + SAVE_S if guard.signs else math.inf
         base = self.settings
         self.settings, told, faults = kept(base)
@@ -120,6 +121,7 @@ class Daemon:
             self.settings.mavlink,
             pose=self.settings.pose,
             guard=guard,
+            numbers=numbers,
             whole=self.settings,
             base=base,
             hands=Hands(
@@ -136,6 +138,7 @@ class Daemon:
             backoff_s=self.settings.daemon.backoff_s,
             on_bytes=self._receive,
             guard=guard,
+            numbers=numbers,
         )
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="pipeline")
         # models load in the worker: the event loop stays free, and they belong to the thread that calls
@@ -335,7 +338,10 @@ class Daemon:
         if not up:
             return
         for message in self.component.due(now_s, self._status()):
-            self.links.send(message)
+            self.links.send(message, but=self.component.apart(message))
+        for number, messages in self.component.own.items():
+            for message in messages:
+                self.links.send_to(number, message)
 
     def _receive(self, number: int, data: bytes) -> None:
         """Bytes from a link. What is asked there is answered there."""
@@ -365,6 +371,7 @@ class Daemon:
             noise_dbfs=detection.level_dbfs - detection.snr_db,
             pose=estimate.pose,
             simulated=self.settings.audio.source != "alsa",
+            ambiguous=self.settings.bearing.estimator == "two-mic",
         )
 
     async def _tick(self) -> None:
@@ -380,7 +387,7 @@ class Daemon:
             next_s = max(next_s, time.monotonic() - 1.0) + 1.0  # after a suspension no second is made up for
             if self._on_second is not None:
                 self._on_second(self)
-            self._watch_signing()
+            self._watch_network()
             self._keep_parameters()
             if self.hearing or self.source_fault:
                 notify(WATCHDOG="1", STATUS=self._in_words())
@@ -399,11 +406,13 @@ class Daemon:
             "losses": {"frames": c.dropped, "overruns": c.overruns, "messages": self.links.dropped},
         }
 
-    def _watch_signing(self) -> None:
-        """Tells the log what the other end does not: that it ignores us. Keeps the timestamp."""
-        complaints = self.component.guard.complaints(time.monotonic())
-        for complaint in set(complaints) - set(self._complaints):
-            log.warning("%s (mavlink.signing_key)", complaint)
+    def _watch_network(self) -> None:
+        """Tells the log what the others do not: that they ignore us, or that one of them goes by our ids.
+        Keeps signing's timestamp."""
+        complaints = self.component.complaints(time.monotonic())
+        for complaint in complaints:
+            if complaint not in self._complaints:
+                log.warning("%s (docs/mavlink.md, What goes wrong)", complaint)
         self._complaints = complaints
         if time.monotonic() >= self._save_s:
             self._save_s = time.monotonic() + SAVE_S

@@ -33,6 +33,8 @@ class Fused:
     """sightings that made it"""
     unused: int
     """those too soon after another, outside the gate, or not usable"""
+    last: Sighting
+    """the latest of them all"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class _Group:
         counted = positioner.counters
         if position is None:
             return _Group(streams, None, positioner.evidence)
-        fused = Fused(position, tuple(streams), counted.used, len(looks) - counted.used)
+        fused = Fused(position, tuple(streams), counted.used, len(looks) - counted.used, looks[-1])
         return _Group(streams, fused, positioner.evidence)
 
 

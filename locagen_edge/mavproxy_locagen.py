@@ -1,7 +1,7 @@
 """A MAVProxy module: bearing lines, ellipses of positions and a list of calls, on the map and in the console.
 
     pip install MAVProxy locagen-edge        # into one environment
-    module load locagen_edge.mavproxy_locagen
+    module load locagen                      # locagen.py, which is installed beside
     locagen                                  # the calls, the last first
     locagen clear | locagen length METRES    # of the map; how long a line is drawn
 
@@ -50,6 +50,7 @@ class Event:
     confidence: float = math.nan
     place: Point | None = None
     confirmed: bool = False
+    ambiguous: bool = False
 
 
 def beyond(here: Point, azimuth_rad: float, distance_m: float) -> Point:
@@ -126,6 +127,7 @@ class Locagen(mp_module.MPModule):  # type: ignore[misc]
         event.azimuth_deg, event.sigma_deg = record.azimuth_true, record.azimuth_sigma
         event.confidence = record.confidence
         event.confirmed |= bool(record.flags & dialect.messages.LOCAGEN_BEARING_FLAGS_CONFIRMED)
+        event.ambiguous = bool(record.flags & dialect.messages.LOCAGEN_BEARING_FLAGS_AMBIGUOUS)
         if UNKNOWN in (record.lat, record.lon) or not math.isfinite(record.azimuth_true):
             return
         here = (record.lat * 1e-7, record.lon * 1e-7)
@@ -177,6 +179,8 @@ class Locagen(mp_module.MPModule):  # type: ignore[misc]
             where = f"{event.azimuth_deg:03.0f} deg true +-{event.sigma_deg:.0f}"
             if not math.isfinite(event.azimuth_deg):
                 where = "no true bearing"
+            if event.ambiguous:
+                where += " or its mirror image"
             place = f", at {event.place[0]:.6f} {event.place[1]:.6f}" if event.place else ""
             sure = " confirmed" if event.confirmed else ""
             since = f"over {event.last_s - event.began_s:.0f} s, {now_s - event.last_s:.0f} s ago"

@@ -121,6 +121,8 @@ class Pipeline:
     def _looks(self, tracks: tuple[Track, ...], pose: Pose | None) -> Iterator[Sighting]:
         """This frame's own bearings of callers, those that went into their positions."""
         s = self._settings
+        if s.bearing.estimator == "two-mic":
+            return  # as likely the mirror image: nobody is sent to a place on the wrong side
         for track in tracks:
             if pose is None or track.look is None or not track.confirmed:
                 continue

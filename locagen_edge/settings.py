@@ -513,10 +513,10 @@ class MavlinkSettings:
     signing_link_id: int = setting(
         0, "Link id in signatures of the first link; the others count on from it.", least=0, most=255
     )
-    signing_state: str = setting(
+    state_directory: str = setting(
         "",
-        "Folder where the last timestamp, and parameters that were set over MAVLink, are kept over restarts; "
-        "empty: the service's state directory, /var/lib/locagen-edge under systemd, else "
+        "Folder where what was set over MAVLink (parameters.toml) and signing's last timestamp are kept over "
+        "restarts; empty: the service's state directory, /var/lib/locagen-edge under systemd, else "
         "~/.local/state/locagen-edge.",
     )
     send_records: bool = setting(
@@ -582,7 +582,7 @@ class DaemonSettings:
     )  # fmt: skip
     backoff_s: float = setting(
         10.0,
-        "Longest wait between two attempts to reopen a source; a link waits for 1.5 s at most.",
+        "Longest wait between two attempts to reopen a source; a link waits for 0.9 s at most.",
         unit="s",
         least=0.1,
         most=600,
@@ -641,7 +641,7 @@ class LogSettings:
         unit="s", least=0.1, most=60,
     )  # fmt: skip
     snippets: bool = setting(
-        False, "Whether the sound of each confirmed call is kept too, as WAV that `replay` reads."
+        False, "Whether the sound of each confirmed call is kept too, as FLAC that `replay` reads."
     )
     before_s: float = setting(
         3.0, "A snippet begins so long before the call was confirmed.", unit="s", least=0, most=30
@@ -651,7 +651,7 @@ class LogSettings:
     )
     longest_s: float = setting(60.0, "A snippet ends here at the latest.", unit="s", least=0.5, most=3600)
     snippets_mb: float = setting(
-        500.0, "All snippets; the oldest is deleted for a new one. Three microphones fill 7 MB a minute.",
+        500.0, "All snippets; the oldest is deleted for a new one. Three microphones fill 4.5 MB a minute.",
         unit="MB", least=0.01, most=1e6,
     )  # fmt: skip
 
@@ -856,6 +856,9 @@ def _faults_of_link(s: Settings) -> Iterator[str]:
             yield f"mavlink.link: {what} {digits} is not a number from 1 to {most}"
 
 
+RENAMED = {"mavlink.signing_state": "mavlink.state_directory"}
+"""keys of earlier versions"""
+
 S = typing.TypeVar("S", bound=Settings)
 
 # --- reading ------------------------------------------------------------------------------------------
@@ -904,7 +907,9 @@ def _section(kind: type, name: str, content: dict[str, Any], faults: list[str]) 
     values: dict[str, Any] = {}
     for key, value in content.items():
         if key not in hints:
-            faults.append(f"{name}.{key}: unknown key; known are {', '.join(hints)}")
+            new = RENAMED.get(f"{name}.{key}")
+            why = f"is called {new} now" if new else f"unknown key; known are {', '.join(hints)}"
+            faults.append(f"{name}.{key}: {why}")
             continue
         try:
             values[key] = _convert(value, hints[key])

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import os
 import socket
 import sys
+import tty
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
@@ -35,9 +38,9 @@ class Peer:
         return [message for message in self.heard if message.get("name") == name]
 
 
-def mavsdk(role: str, url: str) -> AbstractAsyncContextManager[Peer]:
+def mavsdk(role: str, url: str, *xml: str) -> AbstractAsyncContextManager[Peer]:
     """MAVSDK that listens: `mavlink/mavsdk_peer.py`."""
-    return _script("mavsdk_peer.py", role, url)
+    return _script("mavsdk_peer.py", role, url, *xml)
 
 
 def operator(url: str) -> AbstractAsyncContextManager[Peer]:
@@ -67,6 +70,29 @@ async def _script(name: str, *arguments: str) -> AsyncIterator[Peer]:
         except TimeoutError:
             process.kill()
             await process.wait()
+
+
+@asynccontextmanager
+async def null_modem() -> AsyncIterator[tuple[str, str]]:
+    """Two serial devices with a cable between them."""
+    ends = [os.openpty(), os.openpty()]
+    loop = asyncio.get_running_loop()
+
+    def carry(source: int, sink: int) -> None:
+        with contextlib.suppress(OSError):  # nobody reads there, or has opened it yet
+            os.write(sink, os.read(source, 4096))
+
+    for (master, slave), (other, _) in zip(ends, reversed(ends), strict=True):
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        loop.add_reader(master, carry, master, other)
+    try:
+        yield os.ttyname(ends[0][1]), os.ttyname(ends[1][1])
+    finally:
+        for master, slave in ends:
+            loop.remove_reader(master)
+            os.close(slave)
+            os.close(master)
 
 
 def free_port(kind: socket.SocketKind) -> int:

@@ -194,7 +194,7 @@ def operator():
 
 def settings_of(operator: Operator, tmp_path, **sections) -> Settings:
     settings = with_link(operator._server.getsockname()[1], **sections)
-    return changed(settings, mavlink={"signing_state": str(tmp_path)})
+    return changed(settings, mavlink={"state_directory": str(tmp_path)})
 
 
 def test_a_parameter_is_applied_live_and_holds_after_a_restart(operator, tmp_path) -> None:

@@ -29,7 +29,7 @@ from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings, from_table
 from locagen_edge.sim.scene import frames as sim_frames
 from locagen_edge.stages.mic import wav_frames
-from locagen_edge.store import blackbox
+from locagen_edge.store import blackbox, flac, wav
 from locagen_edge.store.blackbox import BlackBox, directory_of
 from locagen_edge.store.journal import Journal, records, size
 from locagen_edge.store.logbook import chosen, row
@@ -241,7 +241,7 @@ def test_start_holds_the_settings(tmp_path):
 
 
 def calls_of(directory: Path) -> list[Path]:
-    return sorted((directory / "calls").glob("*.wav"))
+    return sorted((directory / "calls").glob("*.flac"))
 
 
 def test_a_snippet_holds_what_came_before_the_call_and_after_it(tmp_path):
@@ -280,8 +280,41 @@ def test_a_snippet_replays_to_its_sound_and_tells_of_a_gap(tmp_path):
     assert sum(f.overruns for f in again) == 1
     assert len(again) == len(holed)
     for a, b in zip(holed, again, strict=True):
-        assert a.samples.tobytes() == b.samples.tobytes()
+        assert np.abs(a.samples - b.samples).max() <= 2.0**-23  # 24 bits
         assert a.t_ns - holed[0].t_ns == b.t_ns - again[0].t_ns
+
+
+def test_what_a_loss_of_power_left_is_packed_with_the_next_call(tmp_path):
+    kept(tmp_path, [estimate(n, track=TRACK) for n in range(40)], snippets=True)
+    (whole,) = calls_of(tmp_path)
+    rows, rate = soundfile.read(whole, dtype="float32")
+    torn = whole.with_name("20200101T000000Z-0001.wav.part")
+    soundfile.write(torn, rows, rate, format="WAV", subtype="FLOAT")
+    torn.write_bytes(wav.header(rate, rows.shape[1], "float32", 0) + rows.tobytes())
+    kept(tmp_path, [estimate(n, track=TRACK) for n in range(40)], snippets=True)
+    found = calls_of(tmp_path)
+    assert len(found) == 3
+    assert np.array_equal(soundfile.read(found[0], dtype="float32")[0], rows)
+    assert not [p for p in (tmp_path / "calls").iterdir() if p.suffix in (".wav", ".part")]
+
+
+def test_sound_that_cannot_be_packed_stays_as_it_is(tmp_path, monkeypatch):
+    path = tmp_path / "a.wav"
+    soundfile.write(path, np.zeros((10, 9), np.float32), 10_000)
+    assert flac.pack(path) == path, "more channels than FLAC has"
+    soundfile.write(path, np.zeros((10, 3), np.float32), 10_000)
+
+    def full(file, *_, **__):
+        Path(file).write_bytes(b"fLaC")
+        raise soundfile.LibsndfileError(2)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(soundfile, "write", full)
+        with pytest.raises(OSError, match=r"a\.wav"):
+            flac.pack(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.wav"]
+    assert flac.pack(path).name == "a.flac"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.flac"]
 
 
 def test_snippets_stay_under_their_bounds(tmp_path):

@@ -312,7 +312,7 @@ def test_with_a_key_all_is_signed_and_the_timestamp_outlives_the_daemon(ground, 
     mavlink = {
         "link": f"udpout:127.0.0.1:{port_of(ground)}",
         "signing_key": str(key),
-        "signing_state": str(tmp_path),
+        "state_directory": str(tmp_path),
     }
     settings = from_table({"mavlink": mavlink})
     stamps = []

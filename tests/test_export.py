@@ -15,9 +15,26 @@ from hypothesis import strategies as st
 
 from locagen_edge.cli import _export_news, _export_or_tell
 from locagen_edge.errors import ExportError
-from locagen_edge.export import FORMATS, MOST, SCALE_95, Callers, Event, ellipse, export, geojson, gpx, kml
+from locagen_edge.export import (
+    FORMATS,
+    LINE_M,
+    MOST,
+    SCALE_95,
+    SIGMAS_95,
+    WIDEST_RAD,
+    Callers,
+    Direction,
+    Event,
+    ellipse,
+    export,
+    geojson,
+    gpx,
+    kml,
+    line,
+    sector,
+)
 from locagen_edge.geodesy import north_east_down_m
-from locagen_edge.types import Bearing, Detection, Estimate, Position, Tdoa, Track
+from locagen_edge.types import Bearing, Detection, Estimate, Pose, Position, Tdoa, Track, TrueBearing
 
 GPX = {"g": "http://www.topografix.com/GPX/1/1"}
 KML = {"k": "http://www.opengis.net/kml/2.2"}
@@ -45,11 +62,24 @@ EVENTS = st.builds(
 )
 
 
-@given(st.lists(EVENTS, max_size=3))
+DIRECTIONS = st.builds(
+    Direction,
+    t_ns=st.just(T_NS),
+    latitude_deg=st.floats(-89, 89),
+    longitude_deg=st.floats(-180, 180),
+    azimuth_rad=st.floats(-math.pi, math.pi),
+    azimuth_sigma_rad=st.floats(0.001, 2.0),
+    name=st.text(max_size=20),
+    altitude_m=st.none() | st.floats(-400, 9000),
+)
+
+
+@given(st.lists(EVENTS | DIRECTIONS, max_size=3))
 def test_every_format_parses_whatever_the_names_hold(events):
     assert len(ET.fromstring(gpx(events)).findall("g:wpt", GPX)) == len(events)
     assert len(ET.fromstring(kml(events)).findall(".//k:Folder", KML)) == len(events)
-    assert len(json.loads(geojson(events))["features"]) == 2 * len(events)
+    shapes = sum(2 + isinstance(e, Direction) for e in events)
+    assert len(json.loads(geojson(events))["features"]) == shapes
 
 
 def test_names_come_back_as_they_were():
@@ -106,6 +136,62 @@ def test_an_ellipse_over_the_antimeridian_is_cut_in_two(lon):
     assert all(area(part) > 0 for part in shifted)
 
 
+def from_vehicle(d: Direction, lon: float, lat: float) -> tuple[float, float]:
+    """Distance and direction against the bearing, clockwise."""
+    north, east, _ = north_east_down_m(lat, lon, 0, d.latitude_deg, d.longitude_deg, 0)
+    off = math.atan2(east, north) - d.azimuth_rad
+    return math.hypot(north, east), math.remainder(off, math.tau)
+
+
+@given(DIRECTIONS)
+def test_a_bearing_is_a_line_in_the_middle_of_its_sector(d):
+    here, there = line(d)
+    distance_m, off = from_vehicle(d, *there)
+    assert distance_m == pytest.approx(LINE_M, rel=1e-4)
+    assert off == pytest.approx(0.0, abs=1e-3)
+    ring = sector(d)
+    assert ring[0] == ring[-1] == here
+    assert area([(lon - here[0], lat) for lon, lat in ring]) > 0
+    half = min(SIGMAS_95 * d.azimuth_sigma_rad, WIDEST_RAD)
+    (_, right), (_, left) = from_vehicle(d, *ring[1]), from_vehicle(d, *ring[-2])
+    assert (right, left) == pytest.approx((half, -half), abs=1e-3)
+    assert max(lon for lon, _ in ring) - min(lon for lon, _ in ring) < 1.0, "no jump over half the world"
+
+
+@pytest.mark.parametrize("lon", [179.9999, -179.9999, 180.0, -180.0])
+@pytest.mark.parametrize("azimuth", [math.pi / 2, -math.pi / 2])
+def test_a_bearing_over_the_antimeridian_is_cut_in_two(lon, azimuth):
+    d = Direction(T_NS, 47.0, lon, azimuth, 0.1)
+    _, area_, bearing = (f["geometry"] for f in json.loads(geojson([d]))["features"])
+    crosses = max(abs(x) for x, _ in line(d)) > 180.0
+    assert bearing["type"] == ("MultiLineString" if crosses else "LineString")
+    parts = bearing["coordinates"] if crosses else [bearing["coordinates"]]
+    assert all(-180 <= x <= 180 for part in parts for x, _ in part)
+    length = sum(abs(b[0] - a[0]) for a, b in parts)
+    assert length == pytest.approx(abs(line(d)[1][0] - line(d)[0][0]), abs=1e-6)
+    assert area_["type"] in ("Polygon", "MultiPolygon")
+
+
+def test_a_bearing_alone_is_marked_as_such_in_every_format():
+    d = Direction(T_NS, 47.1, 8.2, math.radians(-48.0), math.radians(3.0), name="caller 1", confidence=0.8)
+    point, shape, bearing = json.loads(geojson([d]))["features"]
+    assert point["geometry"]["coordinates"] == [8.2, 47.1]
+    assert point["properties"]["kind"] == "bearing only"
+    assert point["properties"]["azimuth_true_deg"] == 312.0
+    assert point["properties"]["azimuth_sigma_deg"] == 3.0
+    assert (shape["properties"]["kind"], bearing["properties"]["kind"]) == ("sector", "bearing")
+    assert bearing["geometry"]["type"] == "LineString"
+    root = ET.fromstring(gpx([d]))
+    words = root.findtext("g:wpt/g:desc", namespaces=GPX)
+    assert "312 degrees true, 1-sigma 3 degrees, distance not known" in words
+    assert root.findtext("g:wpt/g:type", namespaces=GPX) == "bearing only"
+    names = [t.findtext("g:name", namespaces=GPX) for t in root.findall("g:trk", GPX)]
+    assert names == ["95 % sector caller 1", "bearing only caller 1"]
+    root = ET.fromstring(kml([d]))
+    assert len(root.findtext(".//k:LineString/k:coordinates", namespaces=KML).split()) == 2
+    assert len(root.findall(".//k:Polygon", KML)) == 1
+
+
 @pytest.mark.parametrize("ending", sorted(FORMATS))
 def test_a_file_is_written_whole(tmp_path, ending):
     path = tmp_path / f"callers{ending.upper()}"
@@ -153,6 +239,35 @@ def test_callers_keep_their_last_place_after_their_track(tmp_path):
     assert [(e.name, e.latitude_deg) for e in callers.events] == [("caller 1", 47.2), ("caller 2", 47.3)]
     # when it was heard: the sound's middle, less its age
     assert callers.events[0].t_ns == T_NS + 10**9 + 50_000_000 - 200_000_000
+
+
+def pointed_at(
+    azimuth: float, *, place: bool = True, confirmed: bool = True, silent_s: float = 0.0
+) -> Estimate:
+    """A frame with one caller, heard from 47, 8 in a direction."""
+    track = Track(
+        1.0, 0.05, -0.3, 0.1, 0.6, silent_s, 0.9, 1, confirmed, TrueBearing(azimuth, 0.06, -0.3, 0.1)
+    )  # fmt: skip
+    pose = Pose(50_000_000, (1.0, 0.0, 0.0, 0.0), 47.0 if place else None, 8.0, 420.0)
+    return replace(heard(0), tracks=(track,), pose=pose)
+
+
+def test_a_caller_without_a_place_is_its_last_bearing_until_there_is_one(tmp_path):
+    callers = Callers(tmp_path / "callers.geojson")
+    callers.hear(pointed_at(1.0, confirmed=False), T_NS)
+    callers.hear(pointed_at(1.0, place=False), T_NS)
+    assert callers.events == [], "not confirmed, or from nowhere known"
+    callers.hear(pointed_at(1.0), T_NS)
+    callers.hear(pointed_at(1.2), T_NS)
+    callers.hear(pointed_at(2.0, silent_s=0.5), T_NS)
+    (told,) = callers.events
+    assert (told.name, told.azimuth_rad, told.latitude_deg) == ("caller 1", 1.2, 47.0)
+    assert told.t_ns == T_NS + 50_000_000
+    callers.hear(heard(0, (1, 47.2)), T_NS)
+    callers.hear(pointed_at(1.4), T_NS)
+    (told,) = callers.events
+    assert isinstance(told, Event), "a place once known stays"
+    assert callers.changed
 
 
 def test_callers_are_bounded(tmp_path):

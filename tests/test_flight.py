@@ -120,7 +120,7 @@ def test_each_bearing_has_the_pose_of_its_moment_and_points_at_the_caller(flown)
 
 def test_the_operator_reads_how_far_it_is_once(flown):
     texts = [m.text for m in flown.said if m.get_type() == "STATUSTEXT"]
-    placed = [t for t in texts if re.fullmatch(r"Call heard: \d{3} deg true, \d+ m \+-\d+ m", t)]
+    placed = [t for t in texts if re.fullmatch(r"Call heard: \d{3} deg true, \d+ m \+-\d+ m, conf \d\.\d", t)]
     assert len(placed) == 1
     distance_m = int(re.search(r"(\d+) m \+", placed[0])[1])
     assert 20 < distance_m < 55
@@ -195,6 +195,23 @@ def test_without_poses_there_are_bearings_and_no_place(flown):
     pipeline = Pipeline(flown.settings)
     heard = [pipeline.process(replace(f, pose=None)) for f in flights.frames(flown.settings, 3.0)]
     assert any(e.track for e in heard)
+    assert not any(e.positions or e.sightings for e in heard)
+
+
+def test_two_microphones_bear_and_place_nobody():
+    """Their mirror image is as likely: on the wrong side of the line that is flown."""
+    settings = from_table(
+        {
+            "array": {"positions_m": [[0, 0.05, 0], [0, -0.05, 0]]},
+            "audio": {"channel_map": [0, 1]},
+            "bearing": {"estimator": "two-mic"},
+            "detection": {"snr_db": -20},
+            "sim": {"snr_db": 20, "call": "white"},
+        }
+    )
+    pipeline = Pipeline(settings)
+    heard = [pipeline.process(f) for f in flights.frames(settings, 5.0)]
+    assert any(e.track and e.track.confirmed and e.track.earth for e in heard)
     assert not any(e.positions or e.sightings for e in heard)
 
 

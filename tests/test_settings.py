@@ -41,6 +41,10 @@ TRIANGLE = [[0.05, 0, 0], [-0.03, 0.05, 0], [-0.03, -0.05, 0]]
 BAD = {
     "unknown section": ({"arrya": {}}, "arrya: unknown section"),
     "unknown key": ({"audio": {"hopp": 1}}, "audio.hopp: unknown key"),
+    "old key": (
+        {"mavlink": {"signing_state": "/tmp"}},
+        "mavlink.signing_state: is called mavlink.state_directory now",
+    ),
     "section as value": ({"audio": 3}, "audio: is a section"),
     "text for number": ({"audio": {"hop": "512"}}, "audio.hop: '512' is not a whole number"),
     "float for int": ({"audio": {"hop": 512.0}}, "audio.hop: 512.0 is not a whole number"),

@@ -35,6 +35,8 @@ UNSUPPORTED: int = messages.MAV_RESULT_UNSUPPORTED
 
 Answer = tuple[int, list[Any]]
 """the result, and messages that were asked for"""
+Given = tuple[float, ...]
+"""param1 to param4"""
 
 
 class Desk(Protocol):
@@ -49,52 +51,56 @@ class Desk(Protocol):
     def requested(self, message_id: int, /) -> Any | None:
         """A message of ours that may be asked for once."""
 
-    def interval_s(self, message_id: int, /) -> float | None:
-        """How often a message of ours is sent; infinite: it is switched off; None: none of ours."""
+    def interval_s(self, message_id: int, link: int, /) -> float | None:
+        """How often a message of ours is sent there; infinite: it is switched off; None: none of ours."""
 
-    def set_interval(self, message_id: int, period_s: float | None, /) -> bool:
-        """None: as the settings say. False: it is none that can be set."""
+    def set_interval(self, message_id: int, period_s: float | None, link: int, /) -> bool:
+        """On that link; None: as the settings say. False: it is none that can be set."""
+
+    def may_change(self, now_s: float, /) -> bool:
+        """Whether one more command is obeyed now."""
 
 
-def _listen(desk: Desk, given: tuple[float, ...]) -> Answer:
+def _listen(desk: Desk, given: Given, _: int) -> Answer:
     if given[0] not in (0.0, 1.0):
         return DENIED, []
     desk.listen(given[0] == 1.0)
     return ACCEPTED, []
 
 
-def _forget_noise(desk: Desk, _: tuple[float, ...]) -> Answer:
+def _forget_noise(desk: Desk, _: Given, __: int) -> Answer:
     desk.forget_noise()
     return ACCEPTED, []
 
 
-def _request(desk: Desk, given: tuple[float, ...]) -> Answer:
+def _request(desk: Desk, given: Given, link: int) -> Answer:
     wanted = whole(given[0])
     if wanted == dialect.MESSAGE_INTERVAL:
-        return _get_interval(desk, given[1:])
+        return _get_interval(desk, given[1:], link)
     message = None if wanted is None else desk.requested(wanted)
     return (DENIED, []) if message is None else (ACCEPTED, [message])
 
 
-def _capabilities(desk: Desk, given: tuple[float, ...]) -> Answer:
-    return _request(desk, (float(dialect.AUTOPILOT_VERSION), 0.0)) if given[0] == 1.0 else (DENIED, [])
+def _capabilities(desk: Desk, given: Given, link: int) -> Answer:
+    version = (float(dialect.AUTOPILOT_VERSION), 0.0)
+    return _request(desk, version, link) if given[0] == 1.0 else (DENIED, [])
 
 
-def _get_interval(desk: Desk, given: tuple[float, ...]) -> Answer:
+def _get_interval(desk: Desk, given: Given, link: int) -> Answer:
     wanted = whole(given[0])
     if wanted is None or not 0 <= wanted <= 0xFFFF:
         return DENIED, []
-    period_s = desk.interval_s(wanted)
+    period_s = desk.interval_s(wanted, link)
     us = 0 if period_s is None else -1 if math.isinf(period_s) else round(period_s * 1e6)  # 0: not available
     return ACCEPTED, [messages.MAVLink_message_interval_message(wanted, us)]
 
 
-def _set_interval(desk: Desk, given: tuple[float, ...]) -> Answer:
+def _set_interval(desk: Desk, given: Given, link: int) -> Answer:
     wanted, us = whole(given[0]), given[1]
     if wanted is None or not (us in (-1.0, 0.0) or FASTEST_US <= us <= 3.6e9):
         return DENIED, []
     period_s = None if us == 0.0 else math.inf if us < 0.0 else us * 1e-6
-    return (ACCEPTED if desk.set_interval(wanted, period_s) else DENIED), []
+    return (ACCEPTED if desk.set_interval(wanted, period_s, link) else DENIED), []
 
 
 def whole(value: float) -> int | None:
@@ -108,9 +114,12 @@ class Command:
 
     name: str
     text: str
-    do: Callable[[Desk, tuple[float, ...]], Answer]
+    do: Callable[[Desk, Given, int], Answer]
+    """the last: the link by which it came"""
     reads: bool = False
     """asks for a message, changes nothing"""
+    of_link: bool = False
+    """what it changes is that link's alone"""
 
 
 TABLE: Mapping[int, Command] = {
@@ -129,8 +138,10 @@ TABLE: Mapping[int, Command] = {
     messages.MAV_CMD_SET_MESSAGE_INTERVAL: Command(
         "MAV_CMD_SET_MESSAGE_INTERVAL",
         "param1 a message of ours that repeats, param2 its interval in us (50000 or more; 0: as the settings "
-        "say, -1: never), on all links, until the program ends. Not for HEARTBEAT.",
+        "say, -1: never), on the link by which it came, until the program ends. LOCAGEN_POSITION and TUNNEL "
+        "go with LOCAGEN_BEARING. Not for HEARTBEAT.",
         _set_interval,
+        of_link=True,
     ),
     messages.MAV_CMD_GET_MESSAGE_INTERVAL: Command(
         "MAV_CMD_GET_MESSAGE_INTERVAL", "param1 a message: MESSAGE_INTERVAL.", _get_interval, reads=True
@@ -158,8 +169,10 @@ class Commands:
         self._desk = desk
         self._done: dict[tuple[int, int], tuple[tuple[Any, ...], float, int]] = {}
 
-    def obey(self, message: Any, sender: tuple[int, int], now_s: float, *, to_all: bool) -> list[Any]:
-        """The answers to a COMMAND_LONG or COMMAND_INT from `sender` (system, component)."""
+    def obey(
+        self, message: Any, sender: tuple[int, int], link: int, now_s: float, *, to_all: bool
+    ) -> list[Any]:
+        """The answers to a COMMAND_LONG or COMMAND_INT from `sender` (system, component) by that link."""
         given = tuple(getattr(message, f"param{n}") for n in range(1, 5))
         known = TABLE.get(message.command)
         if to_all and (known is None or not known.reads):
@@ -167,12 +180,14 @@ class Commands:
         if known is None:
             return [_ack(message.command, UNSUPPORTED, sender)]
         if known.reads:
-            result, asked = known.do(self._desk, given)
+            result, asked = known.do(self._desk, given, link)
             return [] if to_all and result != ACCEPTED else [_ack(message.command, result, sender), *asked]
-        this = (message.command, *given)
+        this = (message.command, *given, *([link] if known.of_link else []))
         what, when_s, result = self._done.get(sender, ((), -math.inf, 0))
         if what != this or now_s - when_s > RESEND_S:
-            result, _ = known.do(self._desk, given)
+            if not self._desk.may_change(now_s):
+                return []
+            result, _ = known.do(self._desk, given, link)
             self._done.pop(sender, None)
             if len(self._done) >= SENDERS:
                 del self._done[next(iter(self._done))]

@@ -44,14 +44,16 @@ from locagen_edge.mavlink.commands import Commands
 from locagen_edge.mavlink.flight import Interlock
 from locagen_edge.mavlink.framer import Framer, Packet
 from locagen_edge.mavlink.identity import version_message
-from locagen_edge.mavlink.pace import Every
+from locagen_edge.mavlink.pace import AtMost, Every
 from locagen_edge.mavlink.parameters import Parameters
 from locagen_edge.mavlink.pose import READ, PoseHistory
+from locagen_edge.mavlink.rates import Rates
 from locagen_edge.mavlink.records import BearingRecord, PositionRecord, bearing_message, position_message
 from locagen_edge.mavlink.signing import Guard
 from locagen_edge.mavlink.streams import GAP_S, Streams
 from locagen_edge.mavlink.targets import Place, adsb_vehicle, camera_target
 from locagen_edge.mavlink.timesync import SyncedClock
+from locagen_edge.mavlink.twins import Numbers, Twins
 from locagen_edge.settings import MavlinkSettings, PoseSettings, Settings
 from locagen_edge.types import Pose, Position, Track
 
@@ -67,7 +69,7 @@ FAULT_GONE_S = 5.0
 TEXT_S = 0.5
 """least mean distance of two texts: a radio link at 57600 baud and a reader's eye both bear it"""
 NOTHING_S = 1.0
-"""how often it is told that nothing is heard"""
+"""how often it is told at most that nothing is heard"""
 CALLS_REMEMBERED = 16
 """tracks of which the operator was told; more than can be followed at a time"""
 TEXTS_WAITING = 8
@@ -77,6 +79,9 @@ REFUSED_S = 5.0
 PLACES_S = 1.0
 COMPUTER_S = 2.0
 """how often callers' places are told as traffic and as a target, and how the computer does"""
+CHANGES_PER_S, CHANGES_AT_ONCE = 20.0, 64
+"""values and commands that are obeyed in a second, and at once (a ground station sends a whole file of
+parameters): each costs a check of all settings. What comes beyond goes unanswered, and comes again."""
 ANSWERS_AT_ONCE = 10
 """answers to a link at a time, 100 a second: a radio link carries no more"""
 ANSWERS_WAITING = 64
@@ -88,6 +93,8 @@ _GROUND_STATION_ID = 255
 
 Moment = tuple[int, bool]
 """microseconds, and whether they are on the autopilot's clock"""
+Made = Iterator[tuple[str, Any]]
+"""names among the counters, and messages"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +119,8 @@ class Status:
     """of the vehicle at that time"""
     simulated: bool = False
     """the sound is synthetic or recorded"""
+    ambiguous: bool = False
+    """a bearing and its mirror image at the axis of the microphones are as likely: there are two of them"""
 
     def place(self, track: Track) -> Position | None:
         """Where the caller of this track is; None too where no range is observable."""
@@ -167,6 +176,7 @@ class Component:
         start_s: float = 0.0,
         pose: PoseSettings | None = None,
         guard: Guard | None = None,
+        numbers: Numbers | None = None,
         *,
         whole: Settings | None = None,
         base: Settings | None = None,
@@ -187,14 +197,19 @@ class Component:
         self._start_s = start_s
         self.received: defaultdict[int, Framer] = defaultdict(Framer)
         """the framers by link, for their counters"""
+        self.own: dict[int, list[bytes]] = {}
+        """beside what `due` returned last: frames for one link alone, which has asked for another interval"""
         self._answers: defaultdict[int, deque[bytes]] = defaultdict(lambda: deque(maxlen=ANSWERS_WAITING))
         self._sender = dialect.Sender(
             self._fixed_id or _FIRST_SYSTEM_ID,
             settings.component_id,
             dialect.COMMANDS | self._interlock.commands,
         )
-        self._every = {id: Every(period_s) for id, period_s in _periods(settings).items()}
-        self._nothing = Every(NOTHING_S)
+        self._heartbeat = Every(HEARTBEAT_S)
+        self._rates = Rates(_periods(settings), NOTHING_S)
+        self._twins = Twins(numbers or Numbers())
+        self.changes = AtMost(CHANGES_PER_S, CHANGES_AT_ONCE)
+        """of settings and state, by others"""
         self._text = Every(TEXT_S)
         self._texts: deque[tuple[int, str]] = deque()
         self._faults: dict[str, float] = {}  # told, and when each was last there
@@ -232,6 +247,9 @@ class Component:
         """Takes bytes from a link, by its number. Never raises on what they hold."""
         for packet in self.received[link].feed(data):
             if not self.guard.admit(packet, now_s):
+                continue
+            if (packet.system_id, packet.component_id) == (self.system_id, self._sender.component_id):
+                self._twins.hear(packet, now_s)  # and nothing is obeyed or answered: two could go on for ever
                 continue
             if packet.message_id == dialect.HEARTBEAT and _is_autopilot(packet):
                 self._hear_autopilot(packet, now_s)
@@ -294,7 +312,7 @@ class Component:
             self._answer(link, *self.parameters.read(message))
 
     def _hear_set(self, _: Packet, message: Any, link: int, now_s: float) -> None:
-        if not self._is_ours(message):
+        if not self._is_ours(message) or not self.changes.admits(now_s):
             return
         before = self.settings
         answers, fault = self.parameters.set(message)
@@ -315,7 +333,7 @@ class Component:
         sender = (packet.system_id, packet.component_id)
         ours = self._is_ours(message)
         if ours or self._is_to_all(message):
-            self._answer(link, *self._commands.obey(message, sender, now_s, to_all=not ours))
+            self._answer(link, *self._commands.obey(message, sender, link, now_s, to_all=not ours))
 
     def _is_ours(self, message: Any) -> bool:
         target = (message.target_system, message.target_component)
@@ -345,19 +363,24 @@ class Component:
             return version_message(self._hands.uid)
         return self._last.get(message_id) if message_id in self._allowed else None
 
-    def interval_s(self, message_id: int, /) -> float | None:
-        """How often a message of ours is sent; infinite: it is switched off; None: none of ours."""
-        if message_id not in self._every:
+    def interval_s(self, message_id: int, link: int, /) -> float | None:
+        """How often a message of ours is sent there; infinite: it is switched off; None: none of ours."""
+        if message_id == dialect.HEARTBEAT:
+            return HEARTBEAT_S
+        if message_id not in _KINDS:
             return None
-        return self._every[message_id].period_s if message_id in self._allowed else math.inf
+        return self._rates.period_s(link, message_id) if message_id in self._allowed else math.inf
 
-    def set_interval(self, message_id: int, period_s: float | None, /) -> bool:
-        """None: as the settings say. False: it is none that can be set."""
-        if message_id not in self._every or message_id == dialect.HEARTBEAT:
-            return False  # the heartbeat's second is what others judge us by
-        default_s = _periods(self.settings.mavlink)[message_id]
-        self._every[message_id].period_s = default_s if period_s is None else period_s
+    def set_interval(self, message_id: int, period_s: float | None, link: int, /) -> bool:
+        """On that link; None: as the settings say. False: it is none that can be set."""
+        if message_id not in _KINDS:
+            return False  # nor the heartbeat: its second is what others judge us by
+        self._rates.ask(link, message_id, period_s)
         return True
+
+    def may_change(self, now_s: float, /) -> bool:
+        """Whether one more command is obeyed now."""
+        return self.changes.admits(now_s)
 
     def put_back(self, settings: Settings, why: str) -> None:
         """The pipeline could not be made for what a parameter asked: these settings hold."""
@@ -374,11 +397,9 @@ class Component:
 
     def _follow_settings(self, before: Settings) -> None:
         """What of them is the component's own."""
-        now, old = self.settings, _periods(before.mavlink)
+        now = self.settings
         self._allowed = _allowed(now.mavlink)
-        for id, period_s in _periods(now.mavlink).items():
-            if period_s != old[id]:
-                self._every[id].period_s = period_s
+        self._rates.follow(_periods(now.mavlink))
         if now.pose.rate_hz != before.pose.rate_hz:
             self._streams.rate_hz = now.pose.rate_hz
             self._streams.ask_all()
@@ -386,20 +407,35 @@ class Component:
     # --- out ------------------------------------------------------------------------------------------
 
     def due(self, now_s: float, status: Status) -> list[bytes]:
-        """The frames to send now. Call it several times as often as `rate_hz`, at least 10 times a second."""
-        self._follow_faults(now_s, (*status.faults, *self.guard.complaints(now_s)))
+        """The frames for all links to send now, but for those that are `apart`; beside them, those in `own`.
+        Call it several times as often as `rate_hz`, at least 10 times a second."""
+        self._follow_faults(now_s, (*status.faults, *self.complaints(now_s)))
         if status.hearing and self.listening:
             self._follow_call(status)
-        for link, value in self.parameters.due(now_s):
-            self._answer(link, value)
+        for of, value in self.parameters.due(now_s):
+            self._answer(of, value)
         frames = []
-        for name, message in self._messages(now_s, status):
+        self.own = {}
+        for link, name, message in self._messages(now_s, status):
             if message.get_msgId() not in self._allowed and message.get_msgId() != dialect.COMMAND_INT:
                 continue
-            frames.append(self._pack(name, message))
+            if link is None:
+                frames.append(self._pack(name, message))
+            else:
+                self.own.setdefault(link, []).append(self._pack(name, message))
             if name == "COMMAND_LONG":
                 self.guard.asked(now_s)
         return frames
+
+    def apart(self, frame: bytes) -> frozenset[int]:
+        """Links to which this frame, one for all, does not go: they have asked for it at other times."""
+        id = int.from_bytes(frame[7:10], "little")
+        return self._rates.apart(_GOES_WITH.get(id, id))
+
+    def complaints(self, now_s: float) -> tuple[str, ...]:
+        """What is wrong on the network, in words for the operator."""
+        ours = self.system_id, self._sender.component_id
+        return (*self.guard.complaints(now_s), *self._twins.complaints(now_s, *ours))
 
     def answers(self, link: int) -> list[bytes]:
         """The frames that go to this link alone, as many as may go now."""
@@ -413,70 +449,63 @@ class Component:
         self._told.clear()
         self._placed.clear()
 
-    def _messages(self, now_s: float, status: Status) -> Iterator[tuple[str, Any]]:
-        if status.hearing and self._every[dialect.HEARTBEAT].due(now_s):
+    def _messages(self, now_s: float, status: Status) -> Iterator[tuple[int | None, str, Any]]:
+        """To whom (None: to all), its name among the counters, and what."""
+        if status.hearing and self._heartbeat.due(now_s):
             state = dialect.STATE_ACTIVE if self.listening else dialect.STATE_STANDBY
-            yield "HEARTBEAT", dialect.heartbeat(dialect.STATE_CRITICAL if status.faults else state)
+            yield None, "HEARTBEAT", dialect.heartbeat(dialect.STATE_CRITICAL if status.faults else state)
         if status.hearing and (wanted := self._streams.due(now_s)) is not None:
-            yield "COMMAND_LONG", dialect.set_message_interval(self.system_id, *wanted)
+            yield None, "COMMAND_LONG", dialect.set_message_interval(self.system_id, *wanted)
         if self.autopilot_heard_s is not None and now_s - self.autopilot_heard_s < GAP_S:
             asked = self.clock.ask(now_s, round(now_s * 1e9)) if status.hearing else None
             if asked:
-                yield "TIMESYNC", asked
-        yield from self._due_texts(now_s)
-        if self._every[dialect.ONBOARD_COMPUTER_STATUS].due(now_s):
-            computer = self._hands.computer(round(now_s * 1e9))
-            if computer is not None:
-                yield "ONBOARD_COMPUTER_STATUS", computer
-        if not (status.hearing and self.listening):
+                yield None, "TIMESYNC", asked
+        for chunk in self._due_texts(now_s):
+            yield None, "STATUSTEXT", chunk
+        sounds = status.hearing and self.listening
+        for id, kind in _KINDS.items():
+            if not (kind.there(status) and (sounds or kind.deaf_too)):
+                continue
+            quiet = id == dialect.LOCAGEN_BEARING and status.track is None
+            if links := self._rates.due(id, now_s, quiet=quiet):
+                made = list(kind.make(self, now_s, status))
+                for link in links:
+                    yield from ((link, name, message) for name, message in made)
+        if not sounds:
             return
-        if status.track and self._every[dialect.NAMED_VALUE_FLOAT].due(now_s):
-            time_boot_ms = round((now_s - self._start_s) * 1000)
-            for name, value in bearing_values(status.track, status.snr_db):
-                yield name, dialect.named_value_float(time_boot_ms, name, value)
-        for message in self._records(now_s, status):
-            yield message.get_type(), message
-            yield "TUNNEL", dialect.tunnel(message)
-        yield from self._due_places(now_s, status.places)
         called = status.track if status.track and is_confirmed(status.track) else None
         for command, text in self._interlock.due(now_s, self.system_id, called, status.places):
             self._say(dialect.SEVERITY_WARNING, text, first=True)
-            yield command.get_type(), command
+            yield None, command.get_type(), command
 
-    def _due_texts(self, now_s: float) -> Iterator[tuple[str, Any]]:
+    def _due_texts(self, now_s: float) -> Iterator[Any]:
         if not self._texts and self.texts_dropped > self._dropped_told:
             left_out = self.texts_dropped - self._dropped_told
             self._dropped_told = self.texts_dropped
             self._say(dialect.SEVERITY_INFO, f"{left_out} texts were left out: too many at once")
         if self._texts and self._text.due(now_s):
             self._text_number = self._text_number % 0xFFFF + 1
-            for chunk in dialect.statustexts(*self._texts.popleft(), self._text_number):
-                yield "STATUSTEXT", chunk
+            yield from dialect.statustexts(*self._texts.popleft(), self._text_number)
 
-    def _due_places(self, now_s: float, places: tuple[Place, ...]) -> Iterator[tuple[str, Any]]:
-        """All as traffic; of targets there is one, the surest."""
-        known = [place for place in places if place.somewhere]
-        if known and self._every[dialect.ADSB_VEHICLE].due(now_s):
-            for place in known:
-                yield "ADSB_VEHICLE", adsb_vehicle(place)
-        if known and self._every[dialect.CAMERA_TRACKING_GEO_STATUS].due(now_s):
-            here = self.poses.at(round(now_s * 1e9))
-            from_deg = None
-            if here.latitude_deg is not None and here.longitude_deg is not None:
-                from_deg = (here.latitude_deg, here.longitude_deg)
-            surest = min(known, key=lambda place: place.sigma_m)
-            yield "CAMERA_TRACKING_GEO_STATUS", camera_target(surest, from_deg)
+    # --- what repeats (the table _KINDS)
 
-    def _records(self, now_s: float, status: Status) -> Iterator[Any]:
+    def _values(self, now_s: float, status: Status) -> Made:
+        time_boot_ms = round((now_s - self._start_s) * 1000)
+        assert status.track is not None
+        for name, value in bearing_values(status.track, status.snr_db):
+            yield name, dialect.named_value_float(time_boot_ms, name, value)
+
+    def _records(self, _: float, status: Status) -> Made:
         """LOCAGEN_BEARING and LOCAGEN_POSITION of all callers, or that nothing is heard."""
-        every = self._every[dialect.LOCAGEN_BEARING]
-        if status.track is None:
-            if math.isfinite(every.period_s) and self._nothing.due(now_s):
-                yield bearing_message(_bearing_record(self._time_of(status), status, None))
-            return
-        if not every.due(now_s):
-            return
+        for message in self._record_messages(status):
+            yield message.get_type(), message
+            yield "TUNNEL", dialect.tunnel(message)
+
+    def _record_messages(self, status: Status) -> Iterator[Any]:
         time = self._time_of(status)
+        if status.track is None:
+            yield bearing_message(_bearing_record(time, status, None))
+            return
         for track in (status.track, *status.others):
             if track is not status.track and not is_confirmed(track):
                 continue
@@ -484,6 +513,25 @@ class Component:
             place = status.place(track)
             if place is not None and is_confirmed(track):
                 yield position_message(_position_record(time, status, place, track.id in self._placed))
+
+    def _traffic(self, _: float, status: Status) -> Made:
+        for place in status.places:
+            if place.somewhere:
+                yield "ADSB_VEHICLE", adsb_vehicle(place)
+
+    def _target(self, now_s: float, status: Status) -> Made:
+        """Of targets there is one, the surest."""
+        here = self.poses.at(round(now_s * 1e9))
+        from_deg = None
+        if here.latitude_deg is not None and here.longitude_deg is not None:
+            from_deg = (here.latitude_deg, here.longitude_deg)
+        surest = min((p for p in status.places if p.somewhere), key=lambda place: place.sigma_m)
+        yield "CAMERA_TRACKING_GEO_STATUS", camera_target(surest, from_deg)
+
+    def _computer(self, now_s: float, _: Status) -> Made:
+        computer = self._hands.computer(round(now_s * 1e9))
+        if computer is not None:
+            yield "ONBOARD_COMPUTER_STATUS", computer
 
     def _time_of(self, status: Status) -> Moment:
         """Of the sound: on the autopilot's clock where that is known, else since our start."""
@@ -506,7 +554,9 @@ class Component:
                 continue
             how_far = _how_far(status, track) if track.id not in self._placed else ""
             if track.id not in self._told or how_far:
-                self._say(dialect.SEVERITY_NOTICE, call_text(track, how_far), first=True)
+                self._say(
+                    dialect.SEVERITY_NOTICE, call_text(track, how_far, ambiguous=status.ambiguous), first=True
+                )
                 self._told.append(track.id)
             if how_far:
                 self._placed.append(track.id)
@@ -557,22 +607,26 @@ def bearing_values(track: Track, snr_db: float) -> Iterator[tuple[str, float]]:
     yield from _value("LG_SNR", snr_db, -200, 200)
 
 
-def call_text(track: Track, how_far: str = "") -> str:
+def call_text(track: Track, how_far: str = "", *, ambiguous: bool = False) -> str:
     """One line for the operator, at most 50 characters: where a confirmed call comes from, with 1-sigma.
 
     `how_far`: the distance in words, where it is known; it takes the place of the bearing's sigma.
+    `ambiguous`: the mirror image at the axis of the microphones is as likely.
     """
-    body = _whole(compass_deg(track.azimuth_rad))
-    where, sigma = f"{body} deg clockwise from nose", math.degrees(track.azimuth_sigma_rad)
+    body = compass_deg(track.azimuth_rad)
+    sigma = math.degrees(track.azimuth_sigma_rad)
+    where = f"{_whole(body)} from nose" if ambiguous else f"{_whole(body)} deg clockwise from nose"
     if track.earth is not None and not math.isnan(true := compass_deg(track.earth.azimuth_rad)):
-        where, sigma = (
-            f"{_whole(true)} deg true, {body} from nose",
-            math.degrees(track.earth.azimuth_sigma_rad),
-        )
-        if how_far:
-            where = f"{_whole(true)} deg true"
+        sigma = math.degrees(track.earth.azimuth_sigma_rad)
+        where = f"{_whole(true)} deg true"
+        if not (how_far or ambiguous):
+            where += f", {_whole(body)} from nose"
+    if ambiguous:
+        where += " or mirrored"
     if how_far:
-        return f"Call heard: {where}, {how_far}"
+        text = f"Call heard: {where}, {how_far}"
+        sure = f", conf {track.confidence:.1f}" if 0.0 <= track.confidence <= 1.0 else ""
+        return text + sure if len(text + sure) <= dialect.TEXT_BYTES else text
     return f"Call heard: {where}" + (f", +-{max(1, round(sigma))} deg" if 0 <= sigma <= 180 else "")
 
 
@@ -612,6 +666,7 @@ def _bearing_record(time: Moment, status: Status, track: Track | None) -> Bearin
         elevation_sigma_rad=None if track.elevation_rad is None else track.elevation_sigma_rad,
         confidence=track.confidence,
         confirmed=is_confirmed(track),
+        ambiguous=status.ambiguous,
     )
 
 
@@ -661,7 +716,6 @@ def _is_autopilot(packet: Packet) -> bool:
 def _periods(settings: MavlinkSettings) -> dict[int, float]:
     """What repeats, and how often in seconds, as the settings say."""
     return {
-        dialect.HEARTBEAT: HEARTBEAT_S,
         dialect.NAMED_VALUE_FLOAT: 1.0 / settings.rate_hz,
         dialect.LOCAGEN_BEARING: 1.0 / settings.rate_hz,  # LOCAGEN_POSITION goes with it
         dialect.ADSB_VEHICLE: PLACES_S,
@@ -676,6 +730,31 @@ def _allowed(settings: MavlinkSettings) -> frozenset[int]:
     return dialect.ALWAYS_SENT.union(*on)
 
 
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """One of the messages that repeat."""
+
+    make: Callable[[Component, float, Status], Made]
+    there: Callable[[Status], bool]
+    """whether there is anything to say"""
+    deaf_too: bool = False
+
+
+def _somewhere(status: Status) -> bool:
+    return any(place.somewhere for place in status.places)
+
+
+_KINDS: dict[int, _Kind] = {
+    dialect.ONBOARD_COMPUTER_STATUS: _Kind(Component._computer, lambda _: True, deaf_too=True),
+    dialect.NAMED_VALUE_FLOAT: _Kind(Component._values, lambda status: status.track is not None),
+    dialect.LOCAGEN_BEARING: _Kind(Component._records, lambda _: True),
+    dialect.ADSB_VEHICLE: _Kind(Component._traffic, _somewhere),
+    dialect.CAMERA_TRACKING_GEO_STATUS: _Kind(Component._target, _somewhere),
+}
+_GOES_WITH = {
+    dialect.LOCAGEN_POSITION: dialect.LOCAGEN_BEARING,
+    dialect.TUNNEL: dialect.LOCAGEN_BEARING,
+}
 _REMEMBERED = frozenset({dialect.LOCAGEN_BEARING, dialect.LOCAGEN_POSITION, dialect.ONBOARD_COMPUTER_STATUS})
 _REQUESTS: dict[int, Callable[[Component, Packet, Any, int, float], None]] = {
     dialect.PING: Component._hear_ping,

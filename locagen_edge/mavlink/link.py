@@ -28,8 +28,8 @@ import serial_asyncio_fast
 
 from locagen_edge.errors import LinkError
 
-OPEN_S = 5.0
-"""longest an attempt to open may take: TCP alone would try for two minutes"""
+OPEN_S = 2.0
+"""longest an attempt to open may take: TCP alone would try for two minutes, ever more seldom"""
 CLOSE_S = 0.3
 """longest we wait for a closed road to be gone"""
 FIRST_WAIT_S = 0.2

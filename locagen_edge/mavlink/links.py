@@ -1,7 +1,8 @@
 """All links of one component: what it says goes to all of them, an answer to the one that asked.
 
 We are a component and no router: what comes in on one link never leaves on another. Each link opens, fails
-and waits for itself (`link.py`), signs under its own link id, and none holds up another.
+and waits for itself (`link.py`), counts its frames (`twins.py`) and signs under its own link id, and none
+holds up another.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from collections.abc import Callable, Sequence
 
 from locagen_edge.mavlink.link import Link, Spec
 from locagen_edge.mavlink.signing import Guard
+from locagen_edge.mavlink.twins import Numbers
 
-BACKOFF_S = 1.5
-"""most between two attempts to open: with the opening itself, a peer that is back is heard within 2 s"""
+BACKOFF_S = 0.9
+"""most between two attempts to open: a peer that is back has a heartbeat, one a second, within 2 s"""
 
 
 class Links:
@@ -26,8 +28,10 @@ class Links:
         backoff_s: float,
         on_bytes: Callable[[int, bytes], None],
         guard: Guard | None = None,
+        numbers: Numbers | None = None,
     ) -> None:
         self._guard = guard or Guard()
+        self._numbers = numbers or Numbers()
 
         def hears(number: int) -> Callable[[bytes], None]:
             return lambda data: on_bytes(number, data)
@@ -59,15 +63,23 @@ class Links:
             return "".join(link.last_error for link in down)
         return "; ".join(f"{link.spec}: {link.last_error}" for link in down)
 
-    def send(self, frame: bytes) -> None:
-        """To all that are up. Never waits."""
+    def send(self, frame: bytes, but: frozenset[int] = frozenset()) -> None:
+        """To all that are up, but these. Never waits."""
         for number, link in enumerate(self.links):
-            if link.up:
-                link.send(self._guard.sign(frame, number))
+            if link.up and number not in but:
+                link.send(self._made_for(frame, number))
+
+    def send_to(self, number: int, frame: bytes) -> None:
+        """To this one alone, where it is up. Never waits."""
+        if self.links[number].up:
+            self.answer(number, frame)
 
     def answer(self, number: int, frame: bytes) -> None:
         """To the link that asked, and no other. Never waits."""
-        self.links[number].send(self._guard.sign(frame, number))
+        self.links[number].send(self._made_for(frame, number))
+
+    def _made_for(self, frame: bytes, number: int) -> bytes:
+        return self._guard.sign(self._numbers.number(frame, number), number)
 
     async def run(self) -> None:
         """Opens all and keeps them open until cancelled."""

@@ -1,4 +1,4 @@
-"""When something that repeats is due. No clock: time is passed in."""
+"""When something that repeats is due, and how much of a flood is. No clock: time is passed in."""
 
 from __future__ import annotations
 
@@ -21,4 +21,24 @@ class Every:
             return False
         on_time = now_s - next_s < self.period_s
         self._last_s = next_s if on_time else now_s
+        return True
+
+
+class AtMost:
+    """Lets through so many a second, and so many at once after a pause: a token bucket."""
+
+    def __init__(self, per_s: float, at_once: int) -> None:
+        self._per_s, self._most = per_s, float(at_once)
+        self._left = self._most
+        self._now_s = -math.inf
+        self.held_back = 0
+        """how many were not let through"""
+
+    def admits(self, now_s: float) -> bool:
+        self._left = min(self._left + max(now_s - self._now_s, 0.0) * self._per_s, self._most)
+        self._now_s = max(now_s, self._now_s)
+        if self._left < 1.0:
+            self.held_back += 1
+            return False
+        self._left -= 1.0
         return True

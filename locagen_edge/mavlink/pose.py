@@ -29,6 +29,9 @@ DRIFT = 2e-4
 """how fast two computers' clocks drift apart at worst: crystals are good for 1e-4 each"""
 REBOOT_MS = 2000.0
 """a `time_boot_ms` this much before the last one is another boot; less: one message overtook the other"""
+LATE_MS = 1000.0
+"""nothing but messages later than `REBOOT_MS` for so long: no link holds so much back. It is another boot,
+whose time has passed the last one's while nothing was heard"""
 
 RANGEFINDER_M = 0.1
 RANGEFINDER_SHARE = 0.03
@@ -49,17 +52,28 @@ class BootClock:
     def __init__(self) -> None:
         self._offset_ms = math.inf
         self._heard_ms = -math.inf
+        self._late_since_ms: float | None = None
 
     def hear(self, time_boot_ms: float, arrived_ns: int) -> bool:
         """Takes the time of a message. True: the autopilot has started anew, and so has this clock."""
-        rebooted = time_boot_ms < self._heard_ms - REBOOT_MS
+        arrived_ms = arrived_ns * 1e-6
+        rebooted = time_boot_ms < self._heard_ms - REBOOT_MS or self._long_late(time_boot_ms, arrived_ms)
         if rebooted:
+            self._late_since_ms = None
             self._offset_ms = math.inf
         elif math.isfinite(self._offset_ms):
             self._offset_ms += DRIFT * max(time_boot_ms - self._heard_ms, 0.0)
         self._heard_ms = time_boot_ms if rebooted else max(time_boot_ms, self._heard_ms)
-        self._offset_ms = min(self._offset_ms, arrived_ns * 1e-6 - time_boot_ms)
+        self._offset_ms = min(self._offset_ms, arrived_ms - time_boot_ms)
         return rebooted
+
+    def _long_late(self, time_boot_ms: float, arrived_ms: float) -> bool:
+        if arrived_ms - time_boot_ms - self._offset_ms <= REBOOT_MS:
+            self._late_since_ms = None
+            return False
+        if self._late_since_ms is None:
+            self._late_since_ms = arrived_ms
+        return arrived_ms - self._late_since_ms >= LATE_MS
 
     def boot_ms(self, t_ns: int) -> float | None:
         """What the autopilot's clock showed at a monotonic time; None: it has not been heard."""

@@ -201,7 +201,7 @@ def read_key(path: Path) -> bytes:
 
 def state_file(settings: Settings) -> Path:
     """Where the timestamp is remembered."""
-    given = settings.mavlink.signing_state or os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    given = settings.mavlink.state_directory or os.environ.get("STATE_DIRECTORY", "").split(":")[0]
     default = Path(os.environ.get("XDG_STATE_HOME", "") or Path.home() / ".local/state") / "locagen-edge"
     return (Path(given) if given else default) / STATE_FILE
 
@@ -242,7 +242,7 @@ def save_timestamp(path: Path, timestamp: int) -> None:
     except OSError as error:
         raise LinkError(
             f"mavlink.signing_key: the last timestamp cannot be kept in {path}: {error.strerror}; "
-            "set mavlink.signing_state to a folder that can be written"
+            "set mavlink.state_directory to a folder that can be written"
         ) from error
 
 

@@ -2,8 +2,8 @@
 
 ArduPilot sends neither attitude nor position to an onboard computer until asked by
 MAV_CMD_SET_MESSAGE_INTERVAL, and forgets it when it starts anew. So all is asked for after a gap in its
-heartbeats, when its clock goes back, and, of what every vehicle has, when it stays away: a command may have
-been lost.
+heartbeats, when its clock goes back, when what came stays away (it may have started faster than that), and,
+of what every vehicle has, when it never came: a command may have been lost.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from locagen_edge.mavlink.pose import ATTITUDE_QUATERNION, GLOBAL_POSITION_INT, 
 
 GAP_S = 3.5
 """three heartbeats missed: it may have started anew"""
+LOST_S, LOST_PERIODS = 1.0, 4.0
+"""what came and has been silent for so long, and so many of its periods, is gone"""
 AGAIN_S = 10.0
 """what stays away is asked for again this often"""
 PACE_S = 0.1
@@ -50,6 +52,8 @@ class Streams:
         """The message to ask for now and its interval in microseconds; None: nothing, or nobody to ask."""
         if self.rate_hz <= 0.0 or now_s - self._beat_s > GAP_S or now_s - self._asked_s < PACE_S:
             return None
+        if not self._queue and any(self._is_lost(id, now_s) for id in _NEVER_MISSING):
+            self.ask_all()
         if not self._queue and now_s - self._asked_s > AGAIN_S:
             self._queue.extend(id for id in _NEVER_MISSING if self._silent_s(id, now_s) > AGAIN_S)
         if not self._queue:
@@ -57,6 +61,11 @@ class Streams:
         self._asked_s = now_s
         id = self._queue.popleft()
         return id, round(1e6 / (self.rate_hz * WANTED[id]))
+
+    def _is_lost(self, id: int, now_s: float) -> bool:
+        """Whether it came since it was asked for, and does no more."""
+        came = self._arrived_s.get(id, -math.inf) > self._asked_s
+        return came and self._silent_s(id, now_s) > max(LOST_S, LOST_PERIODS / (self.rate_hz * WANTED[id]))
 
     def _silent_s(self, id: int, now_s: float) -> float:
         return now_s - self._arrived_s.get(id, -math.inf)

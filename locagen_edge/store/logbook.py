@@ -75,7 +75,7 @@ def _call(r: Record) -> str:
     if r["event"] == "begin":
         return f"{r['call']} begins  {_direction(r['track'])}  {_snr(r['snr_db'])}{where}"
     seconds = (r["t_ns"] - r["begin_t_ns"]) * 1e-9
-    snippet = f"  calls/{r['snippet']}.wav" if r.get("snippet") else ""
+    snippet = f"  calls/{r['snippet']}.flac" if r.get("snippet") else ""
     return f"{r['call']} ends after {seconds:.1f} s, best {_direction(r['best'])}{where}{snippet}"
 
 

@@ -34,7 +34,8 @@ from locagen_edge.types import Array
 
 log = logging.getLogger(__name__)
 
-FILES = re.compile(r"(\d{8}T\d{6}Z-\d{4,})\.(?:wav|blocks\.jsonl|toml)(?:\.part)?")
+FILES = re.compile(r"(\d{8}T\d{6}Z-\d{4,})\.(?:flac|(?:wav|blocks\.jsonl|toml)(?:\.part)?)")
+"""the sound of a call is packed when it is whole (`store/flac.py`)"""
 BLOCKS = ".blocks.jsonl"
 
 

@@ -1,7 +1,7 @@
 """The sound of each call, with what came before it: parts of a recording, cut from the frames that fly.
 
-They hold the microphones at the processing rate, in the channels that `audio.channel_map` chooses them from:
-`replay` reads them with the settings beside them. Time is that of the frames.
+They hold the microphones at the processing rate, in the channels that `audio.channel_map` chooses them from,
+as FLAC once they are whole: `replay` reads them with the settings beside them. Time is that of the frames.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from locagen_edge.errors import StorageError
 from locagen_edge.framing import as_captured
 from locagen_edge.settings import Settings
+from locagen_edge.store.flac import pack
 from locagen_edge.store.folder import prepare
 from locagen_edge.store.part import Block, Bound, Part, Session, recover
 from locagen_edge.types import Frame
@@ -69,7 +70,10 @@ class Snippets:
         """Finishes the snippet that is being written, if any."""
         part, self._part = self._part, None
         if part is not None:
+            room = self._bound.room_for(part, part.size)  # for a moment there are both
             part.close()
+            if room:
+                pack(self._directory / f"{part.name}.wav")
 
     def _new(self, frame: Frame) -> Block:
         """What of this frame has not been heard yet."""
@@ -93,7 +97,8 @@ class Snippets:
 
     def _begin(self, block: Block, utc: datetime) -> None:
         prepare(self._directory)
-        recover(self._directory)
+        for path in recover(self._directory):
+            pack(path)
         self._bound.count()
         session = Session.begin(self._directory, utc)
         self._written_s = 0.0

@@ -1,8 +1,8 @@
-"""A mavsdk peer in a process of its own: `mavsdk_peer.py ground|autopilot URL`.
+"""A mavsdk peer in a process of its own: `mavsdk_peer.py ground|autopilot URL [XML]`.
 
 A process, because mavsdk is a C++ library with threads: what it does when it is torn down must not decide
 whether our tests pass. It prints one JSON object per line for each message of component 191 that it has
-decoded (`ground`), and ends when its input does.
+decoded (`ground`), and ends when its input does. XML: a dialect that it reads at run time.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import os
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 # mavsdk's own log goes to file descriptor 1: it shall not come between our lines.
@@ -35,12 +36,14 @@ def hear(message: Any, _: Any) -> None:
     tell(name=message.message_name, system=message.system_id, component=message.component_id, fields=fields)
 
 
-def watch(mavsdk: Mavsdk) -> None:
+def watch(mavsdk: Mavsdk, xml: str) -> None:
     """Waits for our component, then tells all that it says."""
     while True:
         for system in mavsdk.get_systems():
             if 191 in system.component_ids():
                 direct = MavlinkDirect(system)
+                if xml:
+                    direct.load_custom_xml(Path(xml).read_text(encoding="utf-8"))
                 direct.subscribe_message("", hear)
                 watch.kept = system, direct  # type: ignore[attr-defined]
                 tell(subscribed=True, system=system.get_system_id(), components=system.component_ids())
@@ -48,13 +51,13 @@ def watch(mavsdk: Mavsdk) -> None:
         time.sleep(0.01)
 
 
-def main(role: str, url: str) -> None:
+def main(role: str, url: str, xml: str = "") -> None:
     system, component = IDS[role]
     mavsdk = Mavsdk(Configuration.create_manual(system, component, True))
     mavsdk.add_any_connection(url)
     tell(open=True)
     if role == "ground":
-        threading.Thread(target=watch, args=(mavsdk,), daemon=True).start()
+        threading.Thread(target=watch, args=(mavsdk, xml), daemon=True).start()
     sys.stdin.read()
     os._exit(0)  # no teardown: nothing of it is under test
 

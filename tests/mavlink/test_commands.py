@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from hypothesis import given
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
-from test_component import CALLING, QUIET, decode, said, texts
+from test_component import CALLING, QUIET, TICK_S, decode, said, texts
 from test_parameters import answers, packed, setting
 
 from locagen_edge import __version__
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.commands import ACCEPTED, DENIED, RESEND_S, TABLE, UNSUPPORTED
-from locagen_edge.mavlink.component import Component, Hands
+from locagen_edge.mavlink.component import CHANGES_AT_ONCE, CHANGES_PER_S, Component, Hands, Status
 from locagen_edge.mavlink.computer import Computer
 from locagen_edge.mavlink.framer import Framer
 from locagen_edge.mavlink.identity import machine_uid, version_number
@@ -35,6 +38,20 @@ def command(number: int, *given: float, system: int = 1, component: int = 191, a
 def ask(component: Component, message: Any, now_s: float = 0.0, link: int = 0) -> list[Any]:
     component.receive(packed(message), now_s, link)
     return answers(component, link)
+
+
+def on_link(component: Component, link: int, status: Status, seconds: float, start_s: float) -> list[Any]:
+    """What goes out on one link of several."""
+    frames = []
+    for tick in range(round(seconds / TICK_S)):
+        common_ones = component.due(start_s + tick * TICK_S, status)
+        frames += [frame for frame in common_ones if link not in component.apart(frame)]
+        frames += component.own.get(link, [])
+    return decode(frames)
+
+
+def setting_message(number: int) -> Any:
+    return common.MAVLink_param_set_message(1, 191, b"LG_TRK_COAST", 2.0 + number % 7, 9)
 
 
 def results(messages: list[Any]) -> list[int]:
@@ -136,10 +153,10 @@ def test_start_and_stop() -> None:
 def test_intervals_of_our_own_messages() -> None:
     component = Component(MavlinkSettings())
 
-    def values_in_10_s(start_s: float) -> int:
+    def values_in_10_s(start_s: float, link: int = 0) -> int:
         return sum(
             m.get_type() == "NAMED_VALUE_FLOAT" and m.name == "LG_AZB"
-            for m in said(component, CALLING, 10, start_s)
+            for m in on_link(component, link, CALLING, 10, start_s)
         )
 
     assert values_in_10_s(0) == 20
@@ -149,11 +166,61 @@ def test_intervals_of_our_own_messages() -> None:
         (ack, told) = ask(component, command(common.MAV_CMD_GET_MESSAGE_INTERVAL, 251))
         assert ack.result == ACCEPTED
         assert told.interval_us == (us or 500_000)
+        assert values_in_10_s(100.0 * (k + 1) + 20, link=1) == 20, "the other link's are as the settings say"
+        (_, told) = ask(component, command(common.MAV_CMD_GET_MESSAGE_INTERVAL, 251), link=1)
+        assert told.interval_us == 500_000
     for id, us in ((0, 100_000), (33, 100_000), (251, 10), (251, math.nan), (math.inf, 0), (251, -2)):
         assert results(ask(component, command(INTERVAL, id, us))) == [DENIED]
     assert ask(component, command(REQUEST, 244, 0))[1].interval_us == 1_000_000  # of HEARTBEAT
     assert ask(component, command(REQUEST, 244, 33))[1].interval_us == 0, "none of ours"
     assert ask(component, command(REQUEST, 244, 390))[1].interval_us == -1, "switched off"
+
+
+@hypothesis_settings(max_examples=20)  # minutes of a component's time each
+@given(st.lists(st.tuples(st.integers(0, 2), st.sampled_from([-1.0, 0.0, 1e5, 1e6, 4e6])), max_size=6))
+def test_an_interval_holds_on_the_link_that_asked_and_on_no_other(asked: list[tuple[int, float]]) -> None:
+    component, wanted = Component(MavlinkSettings()), {0: 0.0, 1: 0.0, 2: 0.0}
+    for k, (link, us) in enumerate(asked):
+        assert results(ask(component, command(INTERVAL, 59500, us), 10.0 * k, link)) == [ACCEPTED]
+        wanted[link] = us
+    for link, us in wanted.items():
+        heard = on_link(component, link, CALLING, 20, 1000.0 * (link + 1))
+        kinds = Counter(m.get_type() for m in heard)
+        rate = {0.0: 2.0, -1.0: 0.0}.get(us, 1e6 / us if us else 0.0)
+        assert kinds["LOCAGEN_BEARING"] == kinds["TUNNEL"] == pytest.approx(20 * rate, abs=1)
+        assert kinds["HEARTBEAT"] == 20
+        quiet = on_link(component, link, QUIET, 20, 1000.0 * (link + 1) + 500)
+        told = sum(m.get_type() == "LOCAGEN_BEARING" for m in quiet)
+        assert told == pytest.approx(20 * min(rate, 1.0), abs=1), (
+            "once a second at most that nothing is heard"
+        )
+
+
+def test_the_same_command_by_two_links_is_for_both_and_done_once_where_it_is_for_all() -> None:
+    moving, done = hands()
+    component = Component(MavlinkSettings(), hands=moving)
+    for link in (0, 1):
+        assert results(ask(component, command(INTERVAL, 251, 100_000), 0.1 * link, link)) == [ACCEPTED]
+        assert results(ask(component, command(FORGET), 0.1 * link, link)) == [ACCEPTED]
+    assert done == ["forget", "forget"], "another command came between"
+    for link in (0, 1):
+        assert results(ask(component, command(FORGET), 10.0 + 0.1 * link, link)) == [ACCEPTED]
+    assert done == ["forget"] * 3
+    assert [component.interval_s(251, link) for link in (0, 1, 2)] == pytest.approx([0.1, 0.1, 0.5])
+
+
+def test_of_a_flood_of_changes_only_so_many_are_obeyed_and_questions_still_are() -> None:
+    """2000 a second, each of which would have all settings checked."""
+    moving, done = hands()
+    applied: list[Any] = []
+    component = Component(MavlinkSettings(), hands=replace(moving, apply=applied.append))
+    for k in range(10_000):
+        component.receive(packed(setting_message(k) if k % 2 else command(FORGET, k % 100)), k / 2000.0)
+        component.answers(0)
+    most = CHANGES_AT_ONCE + 5.0 * CHANGES_PER_S + 1
+    assert most / 4 < len(applied) + len(done) <= most
+    assert results(ask(component, command(REQUEST, 148.0), 5.0)) == [ACCEPTED]
+    assert results(ask(component, command(FORGET, 7.0), 9.0)) == [ACCEPTED], "after the flood all is obeyed"
 
 
 def test_the_last_record_comes_again_on_request_while_its_switch_is_on() -> None:

@@ -434,11 +434,15 @@ def test_any_text_fits_and_stays_readable(words: str) -> None:
     assert all(a == b or b == "?" for a, b in zip(words, text, strict=False))
 
 
-@given(st.floats(-10, 10), st.floats(0, 1e9) | st.just(math.nan), st.floats(-10, 10) | st.none())
-def test_a_calls_text_is_never_cut(azimuth: float, sigma: float, true: float | None) -> None:
+@given(
+    st.floats(-10, 10), st.floats(0, 1e9) | st.just(math.nan), st.floats(-10, 10) | st.none(), st.booleans()
+)
+def test_a_calls_text_is_never_cut(azimuth: float, sigma: float, true: float | None, ambiguous: bool) -> None:
     earth = None if true is None else TrueBearing(true, sigma, None, sigma)
     track = replace(TRACK, azimuth_rad=azimuth, azimuth_sigma_rad=sigma, earth=earth)
-    assert len(voice.call_text(track)) <= 50
+    text = voice.call_text(track, ambiguous=ambiguous)
+    assert len(text) <= 50
+    assert ("or mirrored" in text) == ambiguous
 
 
 # --- all of it ----------------------------------------------------------------------------------------
@@ -473,9 +477,9 @@ def test_a_call_without_a_place_is_told_again_once_it_has_one() -> None:
     component = Component(MavlinkSettings())
     first = texts(said(component, replace(PLACED, positions=()), 3))
     assert first == ["Call heard: 012 deg true, 042 from nose, +-4 deg"]
-    assert texts(said(component, PLACED, 10, 3.0)) == ["Call heard: 012 deg true, 50 m +-8 m"]
+    assert texts(said(component, PLACED, 10, 3.0)) == ["Call heard: 012 deg true, 50 m +-8 m, conf 0.9"]
     component.say_again()
-    assert texts(said(component, PLACED, 10, 13.0)) == ["Call heard: 012 deg true, 50 m +-8 m"]
+    assert texts(said(component, PLACED, 10, 13.0)) == ["Call heard: 012 deg true, 50 m +-8 m, conf 0.9"]
 
 
 def test_no_place_is_told_where_the_range_is_not_observable() -> None:
@@ -503,6 +507,13 @@ def test_the_records_say_what_is_known() -> None:
         | flags.LOCAGEN_POSITION_FLAGS_ON_GROUND
         | flags.LOCAGEN_POSITION_FLAGS_CONFIRMED
     )
+
+
+@pytest.mark.parametrize("two", [True, False])
+def test_what_may_as_well_be_mirrored_is_marked(two: bool) -> None:
+    messages = said(Component(MavlinkSettings()), replace(PLACED, ambiguous=two), 1)
+    flags = [m.flags for m in messages if m.get_type() == "LOCAGEN_BEARING"]
+    assert {bool(f & dialect.messages.LOCAGEN_BEARING_FLAGS_AMBIGUOUS) for f in flags} == {two}
 
 
 def test_every_confirmed_caller_has_a_record_and_values_are_of_the_best() -> None:

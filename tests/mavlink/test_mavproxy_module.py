@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -120,6 +121,12 @@ def test_what_has_no_place_or_no_direction_is_listed_and_not_drawn() -> None:
         module.mavlink_packet(arrived(bearing_message(record), tunnel=True))
         assert drawn.shapes == {}
         assert len(module.lines()) == 1
+
+
+def test_what_two_microphones_hear_is_listed_as_ambiguous() -> None:
+    module, _ = loaded()
+    module.mavlink_packet(arrived(bearing_message(replace(BEARING, ambiguous=True)), tunnel=True))
+    assert "090 deg true +-3 or its mirror image" in module.lines()[0]
 
 
 def test_nothing_heard_and_other_messages_are_no_events() -> None:

@@ -12,7 +12,9 @@ from contextlib import asynccontextmanager
 from dataclasses import replace
 
 import pytest
-from peers import WITHIN_S, Peer, free_port, mavsdk
+from conftest import ROOT
+from peers import WITHIN_S, Peer, free_port, mavsdk, null_modem
+from test_component import AWAY, position
 
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.link import Link, parse
@@ -34,6 +36,7 @@ CALLING = Status(
         0.6,
         0.0,
         0.875,
+        5,
         earth=TrueBearing(math.radians(27.75), math.radians(3.25), math.radians(-20.0), 0.1),
     ),
     snr_db=6.5,
@@ -135,6 +138,47 @@ def test_a_ground_station_reads_all_that_we_say(ours: str, theirs: str, kind: so
         async with daemon(ours.format(port)) as one, mavsdk("ground", theirs.format(port)) as ground:
             await check(ground, one, system=1)
             assert one.component.received[0].frames >= 1  # and we read it: its heartbeats at least
+
+    asyncio.run(test())
+
+
+def test_a_ground_station_on_a_serial_line_reads_all_that_we_say() -> None:
+    async def test() -> None:
+        async with (
+            null_modem() as (near, far),
+            daemon(f"serial:{near}:57600") as one,
+            mavsdk("ground", f"serial://{far}:57600") as ground,
+        ):
+            await check(ground, one, system=1)
+            assert one.component.received[0].frames >= 1
+
+    asyncio.run(test())
+
+
+def test_with_our_definition_a_ground_station_decodes_our_messages() -> None:
+    """The XML as it is installed, read at run time by a generator that is not pymavlink's."""
+
+    async def test() -> None:
+        port = free_port(socket.SOCK_DGRAM)
+        xml = str(ROOT / "locagen_edge" / "mavlink" / "locagen.xml")
+        ours, theirs = f"udpout:127.0.0.1:{port}", f"udpin://127.0.0.1:{port}"
+        async with daemon(ours) as one, mavsdk("ground", theirs, xml) as ground:
+            await ground.until(lambda heard: [h for h in heard if h.get("subscribed")])
+            one.status = replace(CALLING, pose=AWAY, positions=(position(5),), noise_dbfs=-41.0)
+            called = await ground.until(
+                lambda _: [m for m in ground.messages("LOCAGEN_BEARING") if m["fields"]["event_id"] == 5]
+            )
+            told = called[0]["fields"]
+            sent = {"azimuth_body": 287.75, "azimuth_true": 27.75, "azimuth_sigma": 2.0, "elevation": -10.0}
+            sent |= {"confidence": 0.875, "snr": 6.5, "noise_level": -41.0, "height": 20.0}
+            sent |= {"lat": 470_000_000, "lon": 80_000_000, "alt": 420_000}
+            assert {name: told[name] for name in sent} == pytest.approx(sent, rel=1e-6)
+            assert told["q"] == [1.0, 0.0, 0.0, 0.0]
+            assert told["flags"] & 8, "azimuth_true holds"
+            place = (await ground.until(lambda _: ground.messages("LOCAGEN_POSITION")))[0]["fields"]
+            assert place["lat"] * 1e-7 == pytest.approx(position().latitude_deg, abs=1e-7)
+            assert (place["event_id"], place["looks"]) == (5, 12)
+            assert (place["covariance_nn"], place["covariance_ne"]) == (60.0, 5.0)
 
     asyncio.run(test())
 

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from autopilot import PILOTS, met
 from conftest import ROOT
-from peers import WITHIN_S, free_port, operator
+from peers import WITHIN_S, free_port, null_modem, operator
 from test_daemon import running, steady, until
 
 from locagen_edge.daemon import Daemon
@@ -39,9 +40,31 @@ async def calls(settings: Settings) -> AsyncIterator[Frame]:
         await asyncio.sleep(0.03)
 
 
+LINKS = ["udp", "tcp", "serial", *PILOTS]
+
+
 @asynccontextmanager
-async def daemon_at(port: int, state: Path) -> AsyncIterator[Daemon]:
-    mavlink = {"link": f"udpout:127.0.0.1:{port}", "signing_state": str(state)}
+async def road(kind: str) -> AsyncIterator[tuple[str, str, str]]:
+    """A link of that kind, or through an autopilot, as we name it, as MAVSDK does and as MAVProxy does."""
+    if kind == "serial":
+        async with null_modem() as (near, far):
+            yield f"serial:{near}:57600", f"serial://{far}:57600", far
+        return
+    if kind in ("stand-in", "simulator"):
+        async with met(kind) as ends:
+            at = "{}:{}".format(*ends.ground)
+            yield ends.companion, f"tcpout://{at}", f"tcp:{at}"
+        return
+    at = f"127.0.0.1:{free_port(socket.SOCK_DGRAM if kind == 'udp' else socket.SOCK_STREAM)}"
+    yield {
+        "udp": (f"udpout:{at}", f"udpin://{at}", f"udpin:{at}"),
+        "tcp": (f"tcpin:{at}", f"tcpout://{at}", f"tcp:{at}"),
+    }[kind]
+
+
+@asynccontextmanager
+async def daemon_at(link: str, state: Path) -> AsyncIterator[Daemon]:
+    mavlink = {"link": link, "state_directory": str(state)}
     settings = from_table({"mavlink": mavlink, "bearing": {"estimator": "far-field"}})
     async with running(settings, sources=calls) as daemon:
         yield daemon
@@ -50,10 +73,14 @@ async def daemon_at(port: int, state: Path) -> AsyncIterator[Daemon]:
 @pytest.mark.skipif(
     importlib.util.find_spec("mavsdk") is None, reason="needs the mavsdk package (extra: dev)"
 )
-def test_mavsdk_lists_sets_and_commands(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", LINKS)
+def test_mavsdk_lists_sets_and_commands(kind: str, tmp_path: Path) -> None:
     async def test() -> None:
-        port = free_port(socket.SOCK_DGRAM)
-        async with daemon_at(port, tmp_path) as daemon, operator(f"udpin://127.0.0.1:{port}") as peer:
+        async with (
+            road(kind) as (ours, theirs, _),
+            daemon_at(ours, tmp_path) as daemon,
+            operator(theirs) as peer,
+        ):
             await peer.until(lambda heard: [h for h in heard if "done" in h])
             told = {key: value for line in peer.heard for key, value in line.items() if key != "result"}
             assert told["listed"] == pytest.approx({n: value_of(Settings(), n) for n in NAMES}, rel=1e-6)
@@ -95,11 +122,12 @@ class Console:
 
 
 @asynccontextmanager
-async def mavproxy(port: int, home: Path) -> AsyncIterator[Console]:
+async def mavproxy(master: str, home: Path) -> AsyncIterator[Console]:
     assert MAVPROXY
     process = await asyncio.create_subprocess_exec(
         MAVPROXY,
-        f"--master=udpin:127.0.0.1:{port}",
+        f"--master={master}",
+        "--baudrate=57600",
         "--target-system=1",
         "--target-component=191",
         "--no-state",
@@ -119,10 +147,14 @@ async def mavproxy(port: int, home: Path) -> AsyncIterator[Console]:
 
 
 @pytest.mark.skipif(MAVPROXY is None, reason="needs MAVProxy (extra: dev)")
-def test_mavproxy_lists_sets_and_commands_and_loads_our_module(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", LINKS)
+def test_mavproxy_lists_sets_and_commands_and_loads_our_module(kind: str, tmp_path: Path) -> None:
     async def test() -> None:
-        port = free_port(socket.SOCK_DGRAM)
-        async with daemon_at(port, tmp_path) as daemon, mavproxy(port, tmp_path) as console:
+        async with (
+            road(kind) as (ours, _, theirs),
+            daemon_at(ours, tmp_path) as daemon,
+            mavproxy(theirs, tmp_path) as console,
+        ):
             await console.until(lambda text: f"Received {len(NAMES)} parameters" in text)
             console.say("param show LG_*")
             await console.until(lambda text: all(name in text for name in NAMES))
@@ -137,8 +169,8 @@ def test_mavproxy_lists_sets_and_commands_and_loads_our_module(tmp_path: Path) -
             console.say("long 400 1")
             await console.until(lambda text: "COMPONENT_ARM_DISARM: UNSUPPORTED" in text)
             await until(lambda: daemon.estimate is None)
-            console.say("module load locagen_edge.mavproxy_locagen")
-            await console.until(lambda text: "Loaded module locagen_edge.mavproxy_locagen" in text)
+            console.say("module load locagen")
+            await console.until(lambda text: "Loaded module locagen" in text)
             console.say("locagen")
             await console.until(lambda text: "no call so far" in text)
             console.say("long 31010 1")

@@ -208,7 +208,7 @@ def test_the_tables_in_the_documentation_are_made_from_the_code() -> None:
 
 @given(st.dictionaries(st.sampled_from(NAMES), st.floats(0, 1, width=32)))
 def test_what_is_kept_is_what_comes_back(tmp_path_factory, values: dict[str, float]) -> None:
-    base = from_table({"mavlink": {"signing_state": str(tmp_path_factory.mktemp("state"))}})
+    base = from_table({"mavlink": {"state_directory": str(tmp_path_factory.mktemp("state"))}})
     component = Component(base.mavlink, whole=base)
     for name, value in values.items():
         component.receive(setting(name, value), 0.0)
@@ -235,7 +235,7 @@ def test_what_is_kept_is_what_comes_back(tmp_path_factory, values: dict[str, flo
     ],
 )
 def test_a_damaged_file_is_told_and_changes_nothing(tmp_path, content: bytes, fault: str) -> None:
-    base = from_table({"mavlink": {"signing_state": str(tmp_path)}})
+    base = from_table({"mavlink": {"state_directory": str(tmp_path)}})
     kept_file(base).write_bytes(content)
     settings, told, faults = kept(base)
     assert settings == base
@@ -246,7 +246,7 @@ def test_a_damaged_file_is_told_and_changes_nothing(tmp_path, content: bytes, fa
 
 
 def test_a_good_line_counts_beside_a_bad_one(tmp_path) -> None:
-    base = from_table({"mavlink": {"signing_state": str(tmp_path)}})
+    base = from_table({"mavlink": {"state_directory": str(tmp_path)}})
     kept_file(base).write_text("LG_OLD = 1\nLG_TRK_COAST = 3\n")
     settings, told, faults = kept(base)
     assert settings.track.coast_s == 3.0

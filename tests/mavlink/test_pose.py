@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common
 
 from locagen_edge.geometry import quaternion, rotation
 from locagen_edge.mavlink.component import Component, Status
-from locagen_edge.mavlink.pose import BootClock, PoseHistory
+from locagen_edge.mavlink.pose import WANTED, BootClock, PoseHistory
 from locagen_edge.mavlink.streams import AGAIN_S, Streams
 from locagen_edge.settings import MavlinkSettings, PoseSettings
 from locagen_edge.types import Pose
@@ -187,6 +187,31 @@ def test_a_reboot_begins_anew() -> None:
     assert v.component.poses.reboots == 1
     assert yaw(v.pose(BOOT_S + 131.05)) == pytest.approx(2.0, abs=1e-5)
     assert v.pose(BOOT_S + 100.0) == Pose(round((BOOT_S + 100.0 + LATE_S) * 1e9), None)
+
+
+def test_a_reboot_that_was_not_heard_of_until_its_clock_had_passed_the_last_begins_anew() -> None:
+    """A minute in the air, two on the ground without power for the link: no time goes back."""
+    v = Vehicle()
+    for k in range(20):
+        v.attitude(BOOT_S + 60.0 + 0.05 * k, 1.0)
+    v.boot_s = BOOT_S + 65.0
+    for k in range(40):
+        v.attitude(BOOT_S + 185.0 + 0.05 * k, 2.0)
+    assert v.component.poses.reboots == 1
+    assert yaw(v.pose(BOOT_S + 186.9)) == pytest.approx(2.0, abs=1e-5)
+
+
+def test_what_a_link_has_held_back_for_a_while_is_no_reboot() -> None:
+    """TCP after a gap: what is 4 s old comes at once."""
+    v = Vehicle()
+    for k in range(20):
+        v.attitude(BOOT_S + 1.0 + 0.05 * k, 1.0)
+    for k in range(80):
+        v.attitude(BOOT_S + 2.0 + 0.05 * k, 1.0, late_s=LATE_S + 4.0 - 0.049 * k)
+    for k in range(20):
+        v.attitude(BOOT_S + 6.0 + 0.05 * k, 1.5)
+    assert v.component.poses.reboots == 0
+    assert yaw(v.pose(BOOT_S + 6.9)) == pytest.approx(1.5, abs=1e-5)
 
 
 def test_a_message_that_was_overtaken_is_no_reboot() -> None:
@@ -371,7 +396,10 @@ def test_what_comes_is_not_asked_for_again_and_what_stays_away_is() -> None:
         v.position(BOOT_S + second, 47.0, 8.0, 500.0, 20.0)
         found = asked(v, 1.0, BOOT_S + second)
         assert second < 1 or not found
-    silent = asked(v, 60.0, BOOT_S + 60.0)
+    gone = asked(v, 5.0, BOOT_S + 60.0)
+    assert {id for _, id, _ in gone} == set(WANTED), "what came and goes: it may have started anew"
+    assert 1.0 < gone[0][0] - (BOOT_S + 59.0) < 2.0
+    silent = asked(v, 60.0, BOOT_S + 65.0)
     assert {id for _, id, _ in silent} == {31, 33}
     assert 2 * 3 <= len(silent) <= 2 * 60 / AGAIN_S
 
@@ -383,9 +411,9 @@ def test_after_a_gap_and_after_a_reboot_all_is_asked_for_again() -> None:
     assert {id for _, id, _ in asked(v, 2.0, BOOT_S + 13.0)} == everything
     v.attitude(BOOT_S + 15.0, 0.0)
     v.boot_s = BOOT_S + 14.0
-    assert asked(v, 1.0, BOOT_S + 16.0) == []
-    v.attitude(BOOT_S + 17.0, 0.0)
-    assert {id for _, id, _ in asked(v, 2.0, BOOT_S + 17.0)} == everything
+    assert asked(v, 0.5, BOOT_S + 15.0) == []
+    v.attitude(BOOT_S + 15.5, 0.0)
+    assert {id for _, id, _ in asked(v, 2.0, BOOT_S + 15.5)} == everything
 
 
 def test_whoever_wants_no_commands_gets_none() -> None:

@@ -200,7 +200,7 @@ def test_a_state_that_is_damaged_is_told(tmp_path):
 
 def test_a_state_that_cannot_be_kept_is_told(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(LinkError, match=r"signing_state"):
+    with pytest.raises(LinkError, match=r"state_directory"):
         signing.save_timestamp(tmp_path / "file" / "state", 1)
 
 
@@ -253,7 +253,7 @@ def test_a_missing_key_is_told(tmp_path):
 
 
 def test_the_settings_make_the_guard(tmp_path):
-    settings = {"signing_key": str(key_file(tmp_path, KEY.hex().encode())), "signing_state": str(tmp_path)}
+    settings = {"signing_key": str(key_file(tmp_path, KEY.hex().encode())), "state_directory": str(tmp_path)}
     we = signing.guard_of(from_table({"mavlink": settings}))
     assert we.signs
     Peer(timestamp=0).reads(ours(we))
