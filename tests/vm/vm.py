@@ -80,7 +80,7 @@ ExecStart=/usr/bin/python3 -c 'while True: pass'
 """,
     "test.service": """
 [Unit]
-Requires=multi-user.target player.service
+Wants=multi-user.target player.service
 After=multi-user.target player.service
 SuccessAction=poweroff-force
 FailureAction=poweroff-force
