@@ -68,6 +68,7 @@ GROUND = {
     "jsonl",
     "poses",
     "highpass",
+    "gone",
 }
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),

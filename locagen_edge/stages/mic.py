@@ -31,6 +31,7 @@ import soundfile
 from locagen_edge.alignment import Aligner
 from locagen_edge.errors import SourceError, SourceHungError
 from locagen_edge.framing import Framer, Tap, in_real_time
+from locagen_edge.gone import close_gone
 from locagen_edge.jsonl import Record, read
 from locagen_edge.poses import Poses, pose_of
 from locagen_edge.resampling import Resampler
@@ -369,6 +370,8 @@ def _opened(sd: ModuleType, settings: Settings) -> Iterator[InputStream]:
             )
             raise SourceError(message) from error
         raise SourceError(f"{_label(settings)}: {_reason(error)}") from error
+    finally:
+        close_gone()
 
 
 INVALID_SAMPLE_RATE = -9997  # PaErrorCode, portaudio.h

@@ -50,6 +50,9 @@ hop = 1024
 [bearing]
 estimator = "far-field"
 
+[daemon]
+backoff_s = 1.0
+
 [mavlink]
 link = ["serial:/dev/ttyS0:57600"]
 """
