@@ -1,7 +1,7 @@
 """Lets go of sound cards that were pulled.
 
 PortAudio (19.6, 19.7) does not close a device that has left: Pa_CloseStream gives up where stopping fails,
-and forgets the stream with its file open and its buffers mapped. The kernel then keeps the dead card, with its
+and forgets the stream with its file open and its buffers mapped. The kernel then keeps the dead card with its
 number and its driver, for as long as this process lives. So what is left of it is unmapped and closed here;
 that its device file is gone tells it from a card that is only silent.
 """
