@@ -1,13 +1,15 @@
-"""Accuracy of one frame's bearing: every estimator of this project, pyroomacoustics', and the bound.
+"""Accuracy of a bearing: every estimator of this project, pyroomacoustics', and the bound.
 
-    python bench/bench_accuracy.py [--trials 500] [--quick] [--output FILE]
+    python bench/bench_accuracy.py [--trials 500] [--processes N] [--quick] [--only NAME ...] [--output FILE]
 
 Plain noise: a far caller on the horizon in the free field, exact fractional delays, noise of each
 microphone's own, SNR over 0 to half the rate, one frame of 0.1 s. Rotor noise: a caller below, in-band SNR,
-four simulated rotors and sensor noise 20 dB below them.
+four simulated rotors and sensor noise 20 dB below them, or recorded ones; one frame, or one second.
 
-Each trial is a stream: noise alone for two seconds, then the frame that is judged. This project's chain hears
-all of it, as it does in flight; its peers get the frame, which is all that they take.
+Each trial is a stream: noise alone for six seconds, then the call that is judged. This project's chain hears
+all of it, as it does in flight; its peers get the call, which is all that they take. `steered` answers
+always, as its peers do: the direction of greatest likelihood. `steered, told` is what the pipeline says,
+which knows "no bearing"; each of those counts as the mean error of a guess.
 
 The bound is Cramer and Rao's for an unknown sound (Hahn & Tretter 1973), from each trial's own spectrum.
 """
@@ -15,14 +17,17 @@ The bound is Cramer and Rao's for an unknown sound (Hahn & Tretter 1973), from e
 from __future__ import annotations
 
 import argparse
+import functools
 import math
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import noises
 import numpy as np
@@ -35,47 +40,61 @@ from locagen_edge.settings import Settings, from_table
 from locagen_edge.sim.calls import CALLS
 from locagen_edge.sim.levels import band_power, from_db
 from locagen_edge.sim.propagation import place, plane_wave
-from locagen_edge.sim.rotors import hubs_m, rotor
-from locagen_edge.types import F64, Frame
+from locagen_edge.sim.rotors import hubs_m
+from locagen_edge.stages.bearing.steered import SteeredLocator
+from locagen_edge.types import F64, Frame, Tdoa
 
-ESTIMATORS = ("steered", "far-field", "hyperbolic", "two-mic", "model:tdoa-mlp")
+ESTIMATORS = ("far-field", "hyperbolic", "two-mic", "model:tdoa-mlp")
 PEERS = ("SRP", "MUSIC", "NormMUSIC", "TOPS")
-LEAD = 40  # frames of noise before the call: 2.1 s
-SETTINGS = from_table({"array": {"tolerance_m": 0.0}})
+LEAD = 120  # frames of noise before the call: 6.1 s
+SETTINGS: Settings = from_table({"array": {"tolerance_m": 0.0}})
 RATE = SETTINGS.audio.rate_hz
 FRAME, HOP = SETTINGS.audio.frame, SETTINGS.audio.hop
+SECOND = FRAME + 18 * HOP  # 1.02 s in whole frames
 POSITIONS = SETTINGS.mic_array.positions_m
-LENGTH = FRAME + LEAD * HOP
+NOTHING = Tdoa(np.zeros(0), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
 class Trial:
     sound: F64
-    """(mics, LENGTH), the call in the last FRAME samples"""
+    """(mics, LEAD * HOP + call)"""
+    call: int
+    """samples at the end that hold the call: FRAME or SECOND"""
     azimuth: float
     bound_deg: float
     """the smallest mean |error|"""
+    positions: F64
 
 
-def excerpt(kind: str, rng: np.random.Generator) -> F64:
-    """(FRAME + 256,) of a call, where it sounds; white is that of the published table, 300-4000 Hz."""
-    n = FRAME + 256
+class Answer(NamedTuple):
+    azimuth: float | None
+    sigma: float | None = None
+
+
+Method = Callable[[Trial], Answer]
+
+
+def excerpt(kind: str, call: int, rng: np.random.Generator) -> F64:
+    """(call + 256,) of a call, where it sounds; white is that of the published table, 300-4000 Hz."""
+    n = call + 256
     if kind == "white":
         spectrum = np.fft.rfft(rng.standard_normal(4 * n))
         frequency = np.fft.rfftfreq(4 * n, 1 / RATE)
         return np.fft.irfft(spectrum * ((frequency >= 300) & (frequency <= 4000)))[:n]
-    sound = CALLS[kind](RATE, RATE, 0.48 * RATE, rng)
-    starts = range(0, len(sound) - n, 256)
+    sound = CALLS[kind](max(RATE, n), RATE, 0.48 * RATE, rng)
+    starts = range(0, len(sound) - n + 1, 256)
     loud = sorted(starts, key=lambda at: -float(np.sum(sound[at : at + n] ** 2)))
     at = loud[rng.integers(max(len(loud) // 2, 1))]
     return sound[at : at + n]
 
 
-def heard(kind: str, azimuth: float, elevation: float, rng: np.random.Generator) -> F64:
-    """(mics, FRAME) without noise."""
-    call = excerpt(kind, rng)
+def heard(
+    kind: str, call: int, positions: F64, azimuth: float, elevation: float, rng: np.random.Generator
+) -> F64:
+    """(mics, call) without noise."""
     u = direction(azimuth, elevation)
-    return plane_wave(call, RATE, POSITIONS, u, SETTINGS.speed_m_s)[:, 128:-128]
+    return plane_wave(excerpt(kind, call, rng), RATE, positions, u, SETTINGS.speed_m_s)[:, 128:-128]
 
 
 def bound_deg(clean: F64, noise_power: float) -> float:
@@ -93,98 +112,110 @@ def bound_deg(clean: F64, noise_power: float) -> float:
 
 def plain(kind: str, snr_db: float, rng: np.random.Generator) -> Trial:
     azimuth = rng.uniform(-math.pi, math.pi)
-    clean = heard(kind, azimuth, 0.0, rng)
+    clean = heard(kind, FRAME, POSITIONS, azimuth, 0.0, rng)
     clean *= 0.02 / np.sqrt(np.mean(clean**2))
     power = 0.02**2 / from_db(snr_db)
-    sound = math.sqrt(power) * rng.standard_normal((len(POSITIONS), LENGTH))
+    sound = math.sqrt(power) * rng.standard_normal((len(POSITIONS), LEAD * HOP + FRAME))
     sound[:, -FRAME:] += clean
-    return Trial(sound, azimuth, bound_deg(clean, power))
+    return Trial(sound, FRAME, azimuth, bound_deg(clean, power), POSITIONS)
 
 
-def rotor_noise(rng: np.random.Generator) -> F64:
-    """(mics, LENGTH): four rotors at 0.3 m, in-band power 1, sensor noise 20 dB below."""
-    noise = np.zeros((len(POSITIONS), LENGTH))
-    for hub in hubs_m(4, 0.3):
-        pieces, made = [], 0
-        for piece in rotor(0.5, RATE, 0.48 * RATE, rng):
-            pieces.append(piece)
-            made += len(piece)
-            if made >= LENGTH:
-                break
-        noise += place(np.concatenate(pieces)[:LENGTH], RATE, POSITIONS, hub, SETTINGS.speed_m_s)
+def hover(seconds: float, positions: F64, _: int, rng: np.random.Generator) -> F64:
+    """(mics, samples): four rotors at half throttle, in-band power 1, sensor noise 20 dB below."""
+    samples = math.ceil(seconds * RATE)
+    noise = np.zeros((len(positions), samples))
+    for hub in hubs_m(4, noises.ARM_M):
+        noise += place(noises.rotor_of(samples, 0.5, rng), RATE, positions, hub, SETTINGS.speed_m_s)
     noise /= math.sqrt(np.mean([band_power(row, RATE) for row in noise]))
     return noise + 0.1 * rng.standard_normal(noise.shape)
 
 
-def hunting_noise(rng: np.random.Generator) -> F64:
-    """The same from rotors whose speeds change by 10 % in a second, sensor noise 10 dB below."""
-    return noises.hunting(LENGTH / RATE, POSITIONS, int(rng.integers(3)), rng)
-
-
-def under_rotors(
-    kind: str,
-    snr_db: float,
-    rng: np.random.Generator,
-    noise: Callable[[np.random.Generator], F64] = rotor_noise,
-) -> Trial:
+def under_rotors(kind: str, snr_db: float, call: int, name: str, rng: np.random.Generator) -> Trial:
+    make, positions = NOISES[name], noises.positions_of(name, POSITIONS)
     azimuth = rng.uniform(-math.pi, math.pi)
-    clean = heard(kind, azimuth, math.radians(rng.uniform(-45, -10)), rng)
+    clean = heard(kind, call, positions, azimuth, math.radians(rng.uniform(-45, -10)), rng)
     clean *= math.sqrt(from_db(snr_db) / np.mean([band_power(row, RATE) for row in clean]))
-    sound = noise(rng)
-    sound[:, -FRAME:] += clean
-    return Trial(0.02 * sound, azimuth, math.nan)
+    samples = LEAD * HOP + call
+    sound = make(samples / RATE, positions, int(rng.integers(3)), rng)[:, :samples]
+    sound[:, -call:] += clean
+    return Trial(0.02 * sound, call, azimuth, math.nan, positions)
 
 
 # --- who is judged ------------------------------------------------------------------------------------
 
 
-def chain(name: str) -> Callable[[Trial], float | None]:
-    """This project's pipeline with a named estimator, fed with the whole stream."""
-    settings: Settings = from_table({"array": {"tolerance_m": 0.0}, "bearing": {"estimator": name}})
-
-    def estimate(trial: Trial) -> float | None:
-        pipeline = Pipeline(settings)
-        for start in range(0, LENGTH - FRAME + 1, HOP):
-            samples = trial.sound[:, start : start + FRAME].astype(np.float32)
-            last = pipeline.process(Frame(samples, float(RATE), round(start / RATE * 1e9), start))
-        return last.bearing.azimuth_rad
-
-    return estimate
+def frames(trial: Trial) -> Iterator[Frame]:
+    for start in range(0, trial.sound.shape[1] - FRAME + 1, HOP):
+        samples = trial.sound[:, start : start + FRAME].astype(np.float32)
+        yield Frame(samples, float(RATE), round(start / RATE * 1e9), start)
 
 
-def peer(name: str) -> Callable[[Trial], float | None]:
+def settings_of(trial: Trial, estimator: str) -> Settings:
+    array = {"positions_m": trial.positions.tolist(), "tolerance_m": 0.0}
+    settings: Settings = from_table({"array": array, "bearing": {"estimator": estimator}})
+    return settings
+
+
+def steered(trial: Trial) -> Answer:
+    """The likeliest direction, by the frame or by the second; nothing is taken for a call, all is learnt."""
+    settings = settings_of(trial, "steered")
+    locate = SteeredLocator(settings)
+    for frame in frames(trial):
+        locate(frame, NOTHING, settings.hop_s)
+        found = locate.likeliest(0 if trial.call == FRAME else 1)
+        locate.settle(False)
+    return Answer(found.azimuth_rad, found.azimuth_sigma_rad)
+
+
+def chain(name: str, trial: Trial) -> Answer:
+    """What this project's pipeline with a named estimator says at the end of the stream."""
+    pipeline = Pipeline(settings_of(trial, name))
+    for frame in frames(trial):
+        said = pipeline.process(frame)
+    followed = said.track if trial.call > FRAME else None
+    if followed is not None:
+        return Answer(followed.azimuth_rad, followed.azimuth_sigma_rad)
+    return Answer(said.bearing.azimuth_rad, said.bearing.azimuth_sigma_rad)
+
+
+@functools.cache
+def peer_for(name: str, positions: tuple[tuple[float, ...], ...]) -> Any:
     """pyroomacoustics' method of that name: its own grid of 1 degree, frames of 256 by 128."""
     import pyroomacoustics
 
-    low, high = SETTINGS.correlation.band_hz
     # warnings about its own deprecated imports and a window that does not matter here
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        method = pyroomacoustics.doa.algorithms[name](
-            POSITIONS[:, :2].T, RATE, 256, c=SETTINGS.speed_m_s, num_src=1
+        return pyroomacoustics.doa.algorithms[name](
+            np.array(positions)[:, :2].T, RATE, 256, c=SETTINGS.speed_m_s, num_src=1
         )
 
-    def estimate(trial: Trial) -> float | None:
-        frame = trial.sound[:, -FRAME:]
-        window = np.hanning(256)
-        starts = range(0, FRAME - 255, 128)
-        spectra = np.stack([np.fft.rfft(frame[:, s : s + 256] * window, axis=1) for s in starts], axis=2)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            method.locate_sources(spectra, freq_range=[low, high])
-        return float(method.azimuth_recon[0])
 
-    return estimate
+def peer(name: str, trial: Trial) -> Answer:
+    method = peer_for(name, tuple(map(tuple, trial.positions.tolist())))
+    low, high = SETTINGS.correlation.band_hz
+    sound = trial.sound[:, -trial.call :]
+    window = np.hanning(256)
+    starts = range(0, trial.call - 255, 128)
+    spectra = np.stack([np.fft.rfft(sound[:, s : s + 256] * window, axis=1) for s in starts], axis=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        method.locate_sources(spectra, freq_range=[low, high])
+    return Answer(float(method.azimuth_recon[0]))
 
 
-def judges() -> tuple[dict[str, Callable[[Trial], float | None]], list[str]]:
-    found = {name: chain(name) for name in ESTIMATORS}
+def judges() -> tuple[dict[str, Method], list[str]]:
+    found: dict[str, Method] = {"steered": steered, "steered, told": partial(chain, "steered")}
+    found |= {name: partial(chain, name) for name in ESTIMATORS}
     if not report.version("pyroomacoustics"):
         return found, list(PEERS)
-    return found | {f"pyroomacoustics {name}": peer(name) for name in PEERS}, []
+    return found | {f"pyroomacoustics {name}": partial(peer, name) for name in PEERS}, []
 
 
 # --- cells --------------------------------------------------------------------------------------------
+
+NOISES: dict[str, noises.Maker] = {"hover": hover, **noises.NOISES}
+RECORDED = "recorded, four microphones"
 
 CELLS: dict[str, tuple[Callable[..., Trial], tuple[Any, ...]]] = {
     **{
@@ -193,59 +224,90 @@ CELLS: dict[str, tuple[Callable[..., Trial], tuple[Any, ...]]] = {
         for snr in (0, 5, 10, 20, 30)
     },
     **{
-        f"{kind} {snr:+d} dB under rotors": (under_rotors, (kind, snr))
+        f"{kind} {snr:+d} dB under {text}": (under_rotors, (kind, snr, FRAME, noise))
+        for noise, text in (("hover", "rotors"), ("hunting", "hunting rotors"))
         for kind, snr in (("speech", -10), ("speech", 0), ("scream", -15), ("scream", -5))
     },
     **{
-        f"{kind} {snr:+d} dB under hunting rotors": (partial(under_rotors, noise=hunting_noise), (kind, snr))
-        for kind, snr in (("speech", 0), ("scream", -5))
+        f"{kind} {snr:+d} dB under {text}, 1 s": (under_rotors, (kind, snr, SECOND, noise))
+        for noise, text, snrs in (
+            ("hover", "rotors", (-15, -20)),
+            ("hunting", "hunting rotors", (-15,)),
+            (RECORDED, "recorded rotors", (-10, -20, -30)),
+        )
+        for kind in ("speech", "scream")
+        for snr in snrs
     },
 }
 
 
-def run(trials: int, names: list[str], only: list[str]) -> Iterator[tuple[str, dict[str, Any]]]:
-    methods = {name: method for name, method in judges()[0].items() if not only or name in only}
-    for cell in names:
-        make, arguments = CELLS[cell]
-        errors: dict[str, list[float]] = {name: [] for name in methods}
-        silent = dict.fromkeys(methods, 0)
-        bounds = []
-        for seed in tqdm(range(trials), desc=cell, leave=False, disable=not sys.stderr.isatty()):
-            trial = make(*arguments, np.random.default_rng([seed, len(cell)]))
-            bounds.append(trial.bound_deg)
-            for name, method in methods.items():
-                azimuth = method(trial)
-                # no bearing is an answer, told apart, and counts as the mean error of a guess
-                silent[name] += azimuth is None
-                error = math.pi / 2 if azimuth is None else abs(wrap(azimuth - trial.azimuth))
-                errors[name].append(math.degrees(error))
-        yield (
-            cell,
-            {
-                "bound_deg": None if math.isnan(bounds[0]) else float(np.mean(bounds)),
-                **{
-                    name: {
-                        "mean_deg": float(np.mean(values)),
-                        "median_deg": float(np.median(values)),
-                        "beyond_15_deg": float(np.mean(np.array(values) > 15)),
-                        "no_bearing": silent[name] / trials,
-                    }
-                    for name, values in errors.items()
+def one(cell: str, names: tuple[str, ...], seed: int) -> tuple[float, dict[str, tuple[float, float | None]]]:
+    """Bound, and each method's |error| with its ratio to the sigma; all in degrees; a guess's for none."""
+    make, arguments = CELLS[cell]
+    trial = make(*arguments, np.random.default_rng([seed, len(cell)]))
+    found = {}
+    for name in names:
+        answer = judges()[0][name](trial)
+        if answer.azimuth is None:
+            found[name] = (math.nan, None)
+            continue
+        error = abs(wrap(answer.azimuth - trial.azimuth))
+        found[name] = (math.degrees(error), error / answer.sigma if answer.sigma else None)
+    return trial.bound_deg, found
+
+
+def summary(said: list[tuple[float, float | None]]) -> dict[str, float | None]:
+    told = np.array([error for error, _ in said])
+    silent = np.isnan(told)
+    # no bearing is an answer, told apart, and counts as the mean error of a guess
+    errors = np.where(silent, 90.0, told)
+    ratios = np.array([ratio for _, ratio in said if ratio is not None])
+    return {
+        "mean_deg": float(errors.mean()),
+        "median_deg": float(np.median(errors)),
+        "beyond_15_deg": float(np.mean(errors > 15)),
+        "no_bearing": float(silent.mean()),
+        "within_1_sigma": float(np.mean(ratios < 1)) if len(ratios) else None,
+        "within_2_sigma": float(np.mean(ratios < 2)) if len(ratios) else None,
+    }
+
+
+def run(
+    trials: int, cells: list[str], only: list[str], processes: int
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    names = tuple(name for name in judges()[0] if not only or name in only)
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        for cell in cells:
+            bar = tqdm(
+                pool.map(partial(one, cell, names), range(trials), chunksize=4),
+                total=trials, desc=cell, leave=False, disable=not sys.stderr.isatty(),
+            )  # fmt: skip
+            done = list(bar)
+            bound = float(np.mean([found[0] for found in done]))
+            yield (
+                cell,
+                {
+                    "bound_deg": None if math.isnan(bound) else bound,
+                    **{name: summary([found[1][name] for found in done]) for name in names},
                 },
-            },
-        )
+            )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--trials", type=int, default=500, help="per cell (default 500)")
+    parser.add_argument("--processes", type=int, default=1, help="side by side (default 1)")
     parser.add_argument("--quick", action="store_true", help="10 trials of three cells")
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME", help="of the estimators, not all")
     parser.add_argument("--output", type=Path, default=report.default("accuracy"))
     arguments = parser.parse_args()
-    names = ["white +10 dB", "speech +0 dB", "scream -5 dB under rotors"] if arguments.quick else list(CELLS)
+    recorded = {cell for cell, (_, wanted) in CELLS.items() if wanted[-1] == RECORDED}
+    cells = [cell for cell in CELLS if cell not in recorded or noises.recordings() is not None]
+    if arguments.quick:
+        cells = ["white +10 dB", "speech +0 dB", "scream -5 dB under rotors"]
     results = {}
-    for cell, result in run(10 if arguments.quick else arguments.trials, names, arguments.only):
+    trials = 10 if arguments.quick else arguments.trials
+    for cell, result in run(trials, cells, arguments.only, max(arguments.processes, 1)):
         results[cell] = result
         bound = result["bound_deg"]
         print(f"{cell}" + (f": bound {bound:.3f} degrees" if bound else ""))
@@ -255,9 +317,15 @@ def main() -> None:
                 print(
                     f"    {name:28}mean {r['mean_deg']:7.3f}  median {r['median_deg']:7.3f}  "
                     f"beyond 15 deg {r['beyond_15_deg']:6.1%} none {r['no_bearing']:6.1%}{times}"
+                    + (
+                        "  sigma {within_1_sigma:.0%} / {within_2_sigma:.0%}".format(**r)
+                        if r["within_1_sigma"]
+                        else ""
+                    )
                 )
         sys.stdout.flush()
-    report.write(arguments.output, missing=judges()[1], cells=results)
+    left_out = [] if arguments.quick else [cell for cell in CELLS if cell not in cells]
+    report.write(arguments.output, missing=judges()[1], left_out=left_out, trials=trials, cells=results)
 
 
 if __name__ == "__main__":

@@ -49,7 +49,8 @@ def _hiss(noise: F64, rng: np.random.Generator) -> F64:
     return _unit(_unit(noise) + 10 ** (SENSOR_DB / 20) * rng.standard_normal(noise.shape))
 
 
-def _rotor(samples: int, throttle: float, rng: np.random.Generator) -> F64:
+def rotor_of(samples: int, throttle: float, rng: np.random.Generator) -> F64:
+    """(samples,) of one rotor."""
     pieces = rotor(throttle, RATE, 0.48 * RATE, rng)
     made = list(itertools.islice(pieces, math.ceil(samples / 7000) + 1))
     return np.concatenate(made)[:samples]
@@ -59,7 +60,7 @@ def steady(seconds: float, positions: F64, number: int, rng: np.random.Generator
     """Four rotors that hover, at 30, 50 or 70 % of throttle."""
     samples, throttle = round(seconds * RATE), (0.3, 0.5, 0.7)[number % 3]
     noise = sum(
-        place(_rotor(samples, throttle, rng), RATE, positions, hub, SPEED_M_S) for hub in hubs_m(4, ARM_M)
+        place(rotor_of(samples, throttle, rng), RATE, positions, hub, SPEED_M_S) for hub in hubs_m(4, ARM_M)
     )
     return _hiss(np.asarray(noise), rng)
 
@@ -74,7 +75,7 @@ def hunting(seconds: float, positions: F64, number: int, rng: np.random.Generato
         zigzag = 4.0 * np.abs((time_s / period_s + rng.uniform()) % 1.0 - 0.5) - 1.0  # slope 4 / period
         speed = np.exp(SWING * period_s / 4.0 * zigzag)
         at = np.cumsum(speed)
-        sound = _rotor(math.ceil(at[-1]) + 1, 0.5, rng)
+        sound = rotor_of(math.ceil(at[-1]) + 1, 0.5, rng)
         # thrust, and with it power, goes with a high power of the speed
         noise += place(
             np.interp(at, np.arange(len(sound)), sound) * speed**2.5, RATE, positions, hub, SPEED_M_S

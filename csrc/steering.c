@@ -23,7 +23,8 @@ static const double PI = 3.14159265358979323846;
 static const double THIN_PHASE = 0.15;
 
 /* Half widths of the parabola through the scores, as phase across the array at the band's upper end: wide
- * where the grid's own step is to be bridged, at last as narrow as float's rounding of the scores allows. */
+ * where the grid's own step is to be bridged, and kept where that is not enough, along a low voice's ridge; at
+ * last as narrow as float's rounding of the scores allows. */
 static const double WIDTHS[] = {0.6, 0.4, 0.2, 0.2};
 
 static const double LOBE = 3.0;  /* radians of phase from a lobe's top to beyond its foot */
@@ -43,7 +44,7 @@ static const double WATCH_SHARE = 1.0 / 300; /* the usual share of one hop in th
 
 static const locagen_spread PLAIN; /* as theory says */
 
-enum { MOST_THINNING = 8, LEAST_COARSE = 8, MOST_LOBES = 4 };
+enum { MOST_THINNING = 8, LEAST_COARSE = 8, MOST_LOBES = 4, MOST_STEPS = 12 };
 
 static steer *state_of(const void *memory)
 {
@@ -219,6 +220,7 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
     s->grid = locagen_take(a, groups * (mics - 1) * 4 * DIRECTIONS);
     s->aim = locagen_take(a, (mics - 1) * 4 * DIRECTIONS);
     s->scores = locagen_take(a, 2 * groups * DIRECTIONS);
+    s->careful = locagen_take(a, groups * DIRECTIONS);
     s->q = locagen_take(a, (size_t)s->bins * DIRECTIONS);
     for (int n = 0; n < s->spans; n++) {
         locagen_span *span = &s->span[n];
@@ -520,13 +522,14 @@ static double prior_of(const steer *s, const locagen_span *x)
  * adds to what was watched: see locagen_spread. */
 static locagen_spread spread_of(const steer *s, locagen_span *x)
 {
-    locagen_spread spread = {.over = x->over};
+    locagen_spread spread = {.over = x->over, .seen = x->over, .careful = x->scores};
     if (x->watched <= 0 || s->learnt <= 0)
         return spread;
     double prior = prior_of(s, x), total = x->watched + prior;
     spread.spread = x->spread;
     spread.rate = (float)(1 / total);
     spread.offset = (float)(prior / total);
+    spread.theory = (float)(1 / (looks(s, x) * averaged(s)));
     return spread;
 }
 
@@ -612,16 +615,24 @@ static long place_in_spread(const steer *s, int n)
     return (long)(n / width) * s->coarse.bins * width + n % width;
 }
 
-/* By how much the spread lessens the looks of coarse bin k in a direction of the grid. */
-static double trust(const steer *s, const locagen_spread *spread, int n, int k)
+/* By how much coarse bin k has strayed before in a direction of the grid, over theory. */
+static double wildness(const steer *s, const locagen_spread *spread, int n, int k)
 {
     if (spread->spread == NULL)
         return 1;
     float watched = spread->spread[place_in_spread(s, n) + (long)k * s->paths->width];
-    return 1 / fmax(1, (double)(spread->rate * watched + spread->offset));
+    return fmax(1, (double)(spread->rate * watched + spread->offset));
 }
 
-/* The same of all bins, in the direction of the grid that a refinement begins with. */
+/* What its looks count for where a source is to be placed that gave these q. */
+static double trust(const steer *s, const locagen_spread *spread, int n, int k)
+{
+    double wild = wildness(s, spread, n, k), theory = (double)spread->theory, reach = REACH * REACH * theory;
+    double over = spread->seen ? (double)spread->seen[place_in_spread(s, n) + (long)k * s->paths->width] : 0;
+    return wild > 1 ? (over * over + reach) / (over * over * (1 + (wild - 1) * theory) + wild * reach) : 1;
+}
+
+/* Looks of all bins, in the direction of the grid that a refinement begins with. */
 static void count_fine_bins(const steer *s, const locagen_spread *spread, double t, int n)
 {
     for (int k = 0; k < s->bins; k++) {
@@ -631,11 +642,10 @@ static void count_fine_bins(const steer *s, const locagen_spread *spread, double
     }
 }
 
-static void score_grid(const steer *s, enum locagen_measure measure, const locagen_spread *spread,
-                       float *scores)
+static void score_grid(const steer *s, enum locagen_measure measure, const locagen_spread *spread)
 {
     float *mean_q = s->scores + (long)groups_of(s) * DIRECTIONS; /* nobody reads it */
-    s->paths->score(s, &s->coarse, measure, spread, s->grid, groups_of(s), scores, mean_q);
+    s->paths->score(s, &s->coarse, measure, spread, s->grid, groups_of(s), s->scores, mean_q);
 }
 
 /* Whether the lobe of one direction may hold the other. */
@@ -645,12 +655,23 @@ static int same_lobe(const steer *s, const double u[3], const double v[3])
     return s->reach * sqrt(fmax(0, dot(d, d) - across * across)) < LOBE;
 }
 
-/* The best direction of the grid outside the lobes of those before it. */
+/* Whether a direction of the grid is no lower than those beside it: each row is a circle, rows end. */
+static int is_top(const steer *s, const float *scores, int n)
+{
+    int row = n / s->azimuths, column = n % s->azimuths;
+    int left = row * s->azimuths + (column + s->azimuths - 1) % s->azimuths;
+    int right = row * s->azimuths + (column + 1) % s->azimuths;
+    return scores[n] >= scores[left] && scores[n] >= scores[right] &&
+           (row == 0 || scores[n] >= scores[n - s->azimuths]) &&
+           (row == s->elevations - 1 || scores[n] >= scores[n + s->azimuths]);
+}
+
+/* The best top of the grid outside the lobes of those before it; a low voice's are wide, and their flanks high. */
 static int next_on_grid(const steer *s, const float *scores, const int *before, int count_before)
 {
     int best = -1;
     for (int n = 0; n < s->azimuths * s->elevations; n++) {
-        if (best >= 0 && !(scores[n] > scores[best]))
+        if ((best >= 0 && !(scores[n] > scores[best])) || !is_top(s, scores, n))
             continue;
         int apart = 1;
         for (int i = 0; i < count_before && apart; i++)
@@ -664,6 +685,8 @@ static int next_on_grid(const steer *s, const float *scores, const int *before, 
 typedef struct {
     int at;              /* on the grid, where the refinement began */
     double u[3], score, mean_q;
+    double careful;      /* score */
+    double rival;        /* score in the best other lobe, over this */
     double along[2][3];  /* the coordinates' axes */
     double hessian[3];   /* xx, xy, yy */
 } aim;
@@ -688,9 +711,10 @@ static void moved(const steer *s, const aim *a, double x, double y, double to[3]
         normalise(to);
 }
 
-/* The best step on the parabola, no longer than `most`. A direction that the score does not depend on (an
- * array in a line) and one that it curves upwards in are followed uphill only a little. */
-static void newton(const double g[2], const double h[3], double most, double step[2])
+/* The best step on the parabola, no longer than `most`; returns whether it would have been. A direction that the
+ * score does not depend on (an array in a line) and one that it curves upwards in are followed uphill only a
+ * little. */
+static int newton(const double g[2], const double h[3], double most, double step[2])
 {
     double middle = -(h[0] + h[2]) / 2, apart = hypot((h[0] - h[2]) / 2, h[1]);
     double largest = fabs(middle) + apart, least = 1e-3 * largest + 1e-30;
@@ -702,10 +726,12 @@ static void newton(const double g[2], const double h[3], double most, double ste
     double length = hypot(step[0], step[1]);
     if (length > most)
         step[0] *= most / length, step[1] *= most / length;
+    return length > most;
 }
 
-/* One Newton step from scores at the corners of a hexagon of half width h and its middle. */
-static void refine_once(const steer *s, enum locagen_measure measure, double h, aim *a)
+/* One Newton step from scores at the corners of a hexagon of half width h and its middle. Returns whether the
+ * top is farther away. */
+static int refine_once(const steer *s, enum locagen_measure measure, double h, aim *a)
 {
     static const double AT[DIRECTIONS][2] = {
         {0, 0}, {1, 0}, {-1, 0}, {0, 1}, {0, -1}, {1, 1}, {-1, -1}, {0, 0},
@@ -729,7 +755,7 @@ static void refine_once(const steer *s, enum locagen_measure measure, double h, 
     a->hessian[2] = (f[3] + f[4] - 2 * f[0]) / (h * h);
     a->hessian[1] = (f[5] + f[6] - f[1] - f[2] - f[3] - f[4] + 2 * f[0]) / (2 * h * h);
     const double *m = a->hessian;
-    newton(g, m, 2 * h, step);
+    int farther = newton(g, m, 2 * h, step);
     if (s->flat) {
         double v[2] = {dot(a->u, s->axes[0]), dot(a->u, s->axes[1])};
         double r = hypot(v[0] + step[0], v[1] + step[1]);
@@ -755,36 +781,49 @@ static void refine_once(const steer *s, enum locagen_measure measure, double h, 
                   0.5 * (m[0] * step[0] * step[0] + 2 * m[1] * step[0] * step[1] + m[2] * step[1] * step[1]);
     a->score = f[0] + fmax(gain, -0.5 * fabs(f[0]));
     a->mean_q = (double)mean_q[0];
+    return farther;
 }
 
 static void refine(const steer *s, enum locagen_measure measure, aim *a)
 {
-    for (size_t n = 0; n < sizeof WIDTHS / sizeof *WIDTHS; n++)
-        refine_once(s, measure, WIDTHS[n] / s->reach, a);
+    int left = MOST_STEPS;
+    for (size_t n = 0; n < sizeof WIDTHS / sizeof *WIDTHS && left > 0; left--)
+        n += !refine_once(s, measure, WIDTHS[n] / s->reach, a);
 }
 
-/* The best direction of all. The grid may put lobes in a wrong order that differ by less than it loses
- * beside a lobe's top: then several are refined. Returns 0 where nothing scores more than `least`. `t`:
- * looks. */
+/* The best direction of all, and what the best in another lobe scores over it. The grid may put lobes in a wrong
+ * order that differ by less than it loses beside a lobe's top: then several are refined. Returns 0 where nothing
+ * scores more than `least`, carefully. `t`: looks. */
 static int find_best(const steer *s, enum locagen_measure measure, const locagen_spread *spread, double t,
-                     float least, float *scores, aim *best)
+                     float least, aim *best)
 {
+    const float *scores = s->scores, *careful = spread->careful ? spread->careful : scores;
     int top[MOST_LOBES], lobes = 0;
-    score_grid(s, measure, spread, scores);
+    double second = 0;
+    score_grid(s, measure, spread);
     for (; lobes < MOST_LOBES; lobes++) {
-        top[lobes] = next_on_grid(s, scores, top, lobes);
-        if (top[lobes] < 0 || !(scores[top[lobes]] > CLOSE * scores[top[0]]))
+        int at = top[lobes] = next_on_grid(s, scores, top, lobes);
+        if (at < 0 || !(scores[at] > 0))
             break;
-        if (!(scores[top[0]] > CLOSE * least))
+        if (lobes == 0 && !(careful[at] > CLOSE * least))
             return 0;
-        aim a = {.at = top[lobes]};
-        memcpy(a.u, s->grid_u + 3 * top[lobes], sizeof a.u);
-        count_fine_bins(s, spread, t, a.at);
+        if (!(scores[at] > CLOSE * CLOSE * scores[top[0]])) {
+            second = fmax(second, (double)scores[at]);
+            break;
+        }
+        aim a = {.at = at};
+        memcpy(a.u, s->grid_u + 3 * at, sizeof a.u);
+        count_fine_bins(s, spread, t, at);
         refine(s, measure, &a);
-        if (lobes == 0 || a.score > best->score)
+        a.careful = a.score * (double)(careful[at] / scores[at]);
+        int better = lobes == 0 || a.score > best->score;
+        if (lobes > 0 && !same_lobe(s, a.u, best->u))
+            second = fmax(second, better ? best->score : a.score);
+        if (better)
             *best = a;
     }
-    return lobes > 0 && best->score > (double)least;
+    best->rival = lobes > 0 ? second / best->score : 0;
+    return lobes > 0 && best->careful > (double)least;
 }
 
 /* 1 / E q of noise, whitened by a matrix from N looks at it: of such an adaptive beam the output power over
@@ -794,38 +833,6 @@ static double unbiased(const steer *s, int mics)
 {
     double n = looks_of(s, s->learnt, s->learnt_variance);
     return fmax(LEAST_UNBIASED, (n - mics + 1) * (n - mics) / (n * n));
-}
-
-/* Whether a direction of the grid is no lower than those beside it: each row is a circle, rows end. */
-static int is_top(const steer *s, const float *scores, int n)
-{
-    int row = n / s->azimuths, column = n % s->azimuths;
-    int left = row * s->azimuths + (column + s->azimuths - 1) % s->azimuths;
-    int right = row * s->azimuths + (column + 1) % s->azimuths;
-    return scores[n] >= scores[left] && scores[n] >= scores[right] &&
-           (row == 0 || scores[n] >= scores[n - s->azimuths]) &&
-           (row == s->elevations - 1 || scores[n] >= scores[n + s->azimuths]);
-}
-
-/* Score of the best top elsewhere, over that of the best. */
-static double rival(const steer *s, const locagen_spread *spread, double t, const float *scores, const aim *best)
-{
-    int at = -1;
-    for (int n = 0; n < s->azimuths * s->elevations; n++)
-        if ((at < 0 || scores[n] > scores[at]) && is_top(s, scores, n) &&
-            !same_lobe(s, s->grid_u + 3 * n, best->u))
-            at = n;
-    if (at < 0)
-        return 0;
-    aim a = {.at = at, .score = (double)scores[at]};
-    if (scores[at] > CLOSE * CLOSE * scores[best->at]) {
-        memcpy(a.u, s->grid_u + 3 * at, sizeof a.u);
-        count_fine_bins(s, spread, t, at);
-        refine(s, MEASURE_RATIO, &a);
-        if (same_lobe(s, a.u, best->u))
-            return 0;
-    }
-    return a.score / best->score;
 }
 
 /* How R_n is to be had; where it was never learnt, its level from the power across the direction of most
@@ -850,7 +857,7 @@ static locagen_whitening whitening(steer *s, const locagen_span *x)
     for (int k = 0; k < s->bins; k++)
         total += (double)s->fine.planes[k];
     aim a;
-    double along = find_best(s, MEASURE_POWER, &PLAIN, 1, 0, s->scores, &a) ? a.score : 0;
+    double along = find_best(s, MEASURE_POWER, &PLAIN, 1, 0, &a) ? a.score : 0;
     double across = (total - along) / (s->bins * ((double)count - 1));
     how.white = (float)fmax(fmax(across, WHITE_SHARE * total / s->bins), (double)s->floor);
     s->paths->invert(s, &how);
@@ -873,7 +880,7 @@ static double contrast(const steer *s, const locagen_spread *spread, int n, int 
         for (int i = first; i <= last; i++)
             p += (double)power[i];
         p = fmax(0, p / (r->thinning * (last - first + 1.0)) - 1);
-        sum += (double)r->looks[k] * trust(s, spread, n, k) * (q - log1p(q) - mics * (p - log1p(p)));
+        sum += (double)r->looks[k] / wildness(s, spread, n, k) * (q - log1p(q) - mics * (p - log1p(p)));
     }
     return sum;
 }
@@ -963,19 +970,17 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
     locagen_spread spread = spread_of(s, x);
     int count = __builtin_popcount((unsigned)how.mics), found = 0;
     aim aims[MOST_MICS];
-    double score[MOST_MICS], mean_q[MOST_MICS], t = looks(s, x), first = 0, second = 0;
+    double score[MOST_MICS], mean_q[MOST_MICS], t = looks(s, x), first = 0;
     count_coarse_bins(s, t);
     for (; found < most && found < count - 1; found++, how.nulls++) {
         aim *a = &aims[found];
         s->paths->whiten(s, &how);
-        if (!find_best(s, MEASURE_RATIO, &spread, t, least, found == 0 ? x->scores : s->scores, a))
+        if (!find_best(s, MEASURE_RATIO, &spread, t, least, a))
             break;
-        score[found] = a->score, mean_q[found] = a->mean_q;
-        if (found == 0) {
+        score[found] = a->careful, mean_q[found] = a->mean_q;
+        if (found == 0)
             first = contrast(s, &spread, a->at, count);
-            second = rival(s, &spread, t, x->scores, a);
-        }
-        spread.over = NULL; /* with nulls they would not be those of the noise */
+        spread.over = NULL, spread.careful = s->careful; /* with nulls they are not those of the noise */
         add_null(s, found, a->u);
         s->fine.least = s->coarse.least = LEAST_AFTER_NULL * (float)count;
     }
@@ -988,7 +993,7 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
         aims[n].score = score[n], aims[n].mean_q = mean_q[n];
         out[n] = told(&aims[n], how.mics);
         out[n].contrast = (float)first;
-        out[n].rival = n == 0 ? (float)second : 0.0f;
+        out[n].rival = n == 0 ? (float)aims[0].rival : 0.0f;
     }
     return found;
 }

@@ -11,6 +11,7 @@
 enum {
     MOST_MICS = 8,
     MOST_SPANS = 4,
+    REACH = 5,      /* standard deviations that noise hardly exceeds in one part of the band */
     MOST_LAG = 64,
     DIRECTIONS = 8, /* directions scored side by side, in one vector or two */
     BIN_BLOCK = 16  /* planes are padded to whole cache lines */
@@ -34,7 +35,7 @@ typedef struct {
     double watched;             /* sum of the weights in `spread` */
     float lost[MOST_MICS];      /* of heard, what lacks this microphone */
     float *signal;              /* R_x times the sum of its weights */
-    float *scores;              /* of the grid, in the last search */
+    float *scores;              /* careful ones of the grid, in the last search */
     float *over, *spread;       /* [vector of directions][coarse bin][lane]: q - 1 where above 0, in the last
                                  * search; its mean square over theory's, times the sum of the weights */
     float *aside[2];            /* sums of such squares, since settle and before */
@@ -77,7 +78,7 @@ typedef struct steer {
     float *nulls;               /* [source][mic][re, im][stride]: the phases of sources found */
     float *grid;                /* [group of directions][mic][start re, im, step re, im][DIRECTIONS] */
     float *aim;                 /* one such group, of the refinement */
-    float *scores;              /* of the grid with nulls, or of its powers */
+    float *scores, *careful;    /* of the grid, the last time; careful ones with nulls */
     float *q;                   /* [bin][lane] */
     double *grid_u;             /* [direction][3] */
 } steer;
@@ -93,12 +94,16 @@ typedef struct {
 
 enum locagen_measure { MEASURE_RATIO, MEASURE_POWER }; /* sum of g(q), or of q */
 
-/* Beside the scores of the grid: where to put its q, and by how much each has spread before:
- * looks / max(1, rate * spread + offset). */
+/* Beside the scores of the grid: its q, and by how much each has spread before, over theory:
+ * wild = max(1, rate * spread + offset). A careful score divides looks by it: whether there is a source. Where it
+ * is, the score tells with nearly all looks of what is far beyond the noise's reach, less what noise takes
+ * that is louder than R_n: as it was before, on average by theory * (wild - 1). */
 typedef struct {
-    float *over;                /* null: nowhere */
+    float *over, *careful;      /* where to put q - 1 and careful scores; null: nowhere */
+    const float *seen;          /* q - 1 of the grid before any null */
     const float *spread;        /* null: as theory says */
     float rate, offset;
+    float theory;               /* mean (q - 1)^2 of noise as theory has it */
 } locagen_spread;
 
 typedef struct locagen_steer_paths {

@@ -84,14 +84,15 @@ INLINE vec logarithm(vec x)
     return exponent * 0.69314718f + 2.0f * t * (1.0f + s * (1.0f / 3 + s * (1.0f / 5 + s * (1.0f / 7))));
 }
 
-/* From q at every bin to the score: the average over neighbours as a running sum, g, the sum over bins.
+/* From q at every bin to the scores: the average over neighbours as a running sum, g, the sum over bins.
  * `at`: where in the spread the directions' own begins. */
 STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const locagen_spread *spread,
                  long at, const float *q, float *score, float *mean_q)
 {
     const vec one = all(1.0f), most = all(1e9f); /* 90 dB: its square is finite */
+    const vec reach = all(REACH * REACH * spread->theory);
     long bins = r->bins, half = r->half;
-    vec plain = all(0.0f), sum = all(0.0f), window = all(0.0f);
+    vec plain = all(0.0f), sum = all(0.0f), careful = all(0.0f), window = all(0.0f);
     for (long k = 0; k < half; k++)
         window += load(q + k * WIDTH);
     for (long k = 0; k < bins; k++) {
@@ -103,14 +104,20 @@ STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const 
         if (k > half)
             window -= load(q + (k - half - 1) * WIDTH);
         vec over = larger(window * r->share[k] - one, all(0.0f));
-        vec looks = all(r->looks[k]);
-        if (spread->spread)
-            looks /= larger(spread->rate * load(spread->spread + at + k * WIDTH) + spread->offset, one);
         if (spread->over)
             store(spread->over + at + k * WIDTH, -larger(-over, -most));
-        sum += looks * (over - logarithm(one + over));
+        vec gain = r->looks[k] * (over - logarithm(one + over));
+        if (spread->spread) {
+            vec wild = larger(spread->rate * load(spread->spread + at + k * WIDTH) + spread->offset, one);
+            careful += gain / wild;
+            vec x = over * over, louder = one + (wild - one) * spread->theory;
+            gain *= (x + reach) / (x * louder + wild * reach);
+        }
+        sum += gain;
     }
     store(score, measure == MEASURE_POWER ? plain : sum);
+    if (spread->careful)
+        store(spread->careful + at / bins, spread->spread ? careful : sum);
     store(mean_q, plain * (1.0f / (float)bins));
 }
 

@@ -34,7 +34,7 @@ learnt from fewer is nearly singular, and whitening by it invents sources."""
 
 LAG_S = 0.5
 """Noise is learnt so late: by then a call is known as one, and its beginning is not learnt."""
-MEANING = 1.6
+MEANING = 1.3
 """Evidence from which a direction means something, though not yet a call."""
 WATCH_S = 15.0
 LOUDER = -0.5
@@ -47,7 +47,7 @@ FLAT = 0.93
 """Least score over the best from which all directions are alike: noise far louder than what was learnt."""
 SILENCE = 1e-11
 """-110 dBFS mean square in the band: a muted input teaches nothing."""
-RIVAL = 0.9
+RIVAL = 0.95
 """Score of another lobe over the best from which nobody knows which is true: 0.96 and more for a whistle of
 3 kHz, whose wavelength is shorter than twice the array; under 0.7 for voices."""
 SECOND = 0.2
@@ -225,6 +225,9 @@ class SteeredLocator:
     def _told(self, source: Source, span: int, evidence: Evidence) -> Bearing:
         if source.rival > RIVAL:
             return no_bearing(NAME, evidence)
+        return self._placed_at(source, span, evidence)
+
+    def _placed_at(self, source: Source, span: int, evidence: Evidence | None) -> Bearing:
         azimuth_sigma, elevation_sigma = source.sigma_rad()
         of_azimuth, of_elevation = self._of_positions(source)
         azimuth_sigma = math.hypot(azimuth_sigma, of_azimuth)
@@ -252,6 +255,11 @@ class SteeredLocator:
         seen[1, 1] += 0.5 * self._tolerance * seen[0, 0]
         scale = self._tolerance_m / math.sqrt(max(float(np.linalg.det(seen)), 1e-18))
         return scale * math.sqrt(seen[1, 1]) / level, scale * math.sqrt(seen[0, 0])
+
+    def likeliest(self, span: int = 0) -> Bearing:
+        """The best direction of a span's last frame, however little it stands out: to judge the search by."""
+        found = self._search.search(1, span)
+        return self._placed_at(found[0], span, None) if found else no_bearing(NAME)
 
     def scores(self, bearing: Bearing) -> tuple[F32, F32]:
         """What a bearing of this frame was taken from: azimuths (columns,) and scores (rows, columns)."""
