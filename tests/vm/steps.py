@@ -179,7 +179,7 @@ def crashes_again_and_again() -> str:
 
 
 def card_pulled_and_back() -> str:
-    """Three times. It looks once a second; here one look alone, PortAudio's start, takes more than a second."""
+    """Three times. It looks once a second; here one look alone takes longer than that: PortAudio starts."""
     until("reading", sounding, 10)
     process, found_s, load = show("MainPID"), [], 0.0
     for away_s in (4.0, 1.0, 6.5):
