@@ -26,7 +26,7 @@ CARD = "snd_aloop.0"
 CAPTURE = Path("/proc/asound/Loopback/pcm1c/sub0/status")
 POLL_S = 0.1
 PATIENCE_S = 120.0
-"""where no bound is promised: an emulated processor on a busy machine may take a minute to start the service"""
+"""where no bound is promised: an emulated processor on a busy machine may take a minute for a start"""
 
 
 class Failed(Exception):
