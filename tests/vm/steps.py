@@ -40,8 +40,8 @@ def systemctl(*arguments: str) -> str:
     return done.stdout.strip()
 
 
-def show(name: str, unit: str = UNIT) -> str:
-    return systemctl("show", "-P", name, unit)
+def show(name: str) -> str:
+    return systemctl("show", "-P", name, UNIT)
 
 
 def until(what: str, holds: Callable[[], object], within_s: float) -> float:
@@ -220,8 +220,8 @@ def unbind() -> None:
         raise Failed(f"somebody holds on to the card: {holders}") from None
 
 
-def cpu_s(unit: str = UNIT) -> float:
-    return int(show("CPUUsageNSec", unit)) * 1e-9
+def cpu_s() -> float:
+    return int(show("CPUUsageNSec")) * 1e-9
 
 
 def memory_is_bounded() -> str:
@@ -251,29 +251,6 @@ def processor_is_bounded() -> str:
     if not 0.5 < share < 1.1:
         raise Failed(f"{share:.2f} cores")
     return f"three busy threads more: {share:.2f} cores in all, of {os.cpu_count()}"
-
-
-def has_its_share_among_busy_neighbours() -> str:
-    """All want all there is: four services of usual weight, and ours of four times that, get half each."""
-    until("listening", listening, PATIENCE_S)
-    names = [f"busy@{number}.service" for number in range(4)]
-    systemctl("start", *names)
-    hogs = [hog("while True: pass") for _ in range(3)]
-    time.sleep(2)
-    before = cpu_s(), sum(map(cpu_s, names))
-    time.sleep(8)
-    ours, theirs = (
-        after - then for after, then in zip((cpu_s(), sum(map(cpu_s, names))), before, strict=True)
-    )
-    for one in hogs:
-        one.kill()
-        one.wait()
-    systemctl("stop", *names)
-    share = ours / (ours + theirs)
-    told = f"{100 * share:.0f} % of the processor beside four busy services"
-    if not 0.4 < share < 0.6:  # with the usual weight: 0.2
-        raise Failed(told)
-    return told
 
 
 def stops() -> str:
@@ -312,7 +289,6 @@ STEPS = (
     killed,
     hangs,
     card_pulled_and_back,
-    has_its_share_among_busy_neighbours,
     processor_is_bounded,
     memory_is_bounded,
     crashes_again_and_again,

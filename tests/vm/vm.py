@@ -77,10 +77,6 @@ aplay -q -D hw:Loopback,0 -t raw -f S16_LE -c 4 -r 48000 --buffer-time=200000'
 Restart=always
 RestartSec=50ms
 """,
-    "busy@.service": """
-[Service]
-ExecStart=/usr/bin/python3 -c 'while True: pass'
-""",
     "test.service": """
 [Unit]
 Wants=multi-user.target player.service
