@@ -9,7 +9,7 @@ override DESTDIR := $(abspath $(DESTDIR))
 endif
 BIN    := $(VENV)/bin
 CFLAGS_C := -std=gnu11 -Wall -Wextra -Werror -fno-math-errno -fno-trapping-math
-KERNEL_C := $(filter-out csrc/test_kernel.c, $(wildcard csrc/*.c))
+KERNEL_C := $(filter-out csrc/test_%.c, $(wildcard csrc/*.c))
 KERNEL := $(wildcard csrc/*.c csrc/*.h) csrc/build_kernel.py setup.py pyproject.toml \
     locagen_edge/mavlink/locagen.xml locagen_edge/mavlink/build_dialect.py
 SYSTEMD_DIR := /lib/systemd/system
@@ -62,8 +62,9 @@ $(VENV)/.flight: $(KERNEL)
 # --- for developers
 
 .PHONY: test
-test: $(VENV)/.dev csrc-test csrc-test-aarch64 ## sets up and runs all tests
+test: $(VENV)/.dev csrc-test csrc-test-threads csrc-test-aarch64 ## sets up and runs all tests
 	$(call need,libasound2-dev,tests with a virtual sound card)
+	$(call need,pulseaudio pulseaudio-utils libasound2-plugins,tests with a sound server)
 	$(BIN)/python -m pytest
 
 .PHONY: check
@@ -94,6 +95,14 @@ build/test_kernel: csrc/test_kernel.c $(KERNEL_C) $(wildcard csrc/*.h)
 	@mkdir -p build
 	$(CC) $(CFLAGS_C) -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -Icsrc -o $@ csrc/test_kernel.c $(KERNEL_C) -lm
 
+.PHONY: csrc-test-threads
+csrc-test-threads: build/test_threads ## states of their own in threads of their own, under TSan
+	./build/test_threads
+
+build/test_threads: csrc/test_threads.c $(KERNEL_C) $(wildcard csrc/*.h)
+	@mkdir -p build
+	$(CC) $(CFLAGS_C) -O1 -g -fsanitize=thread -Icsrc -o $@ csrc/test_threads.c $(KERNEL_C) -lm -lpthread
+
 .PHONY: csrc-test-aarch64
 csrc-test-aarch64: ## the same for aarch64 under qemu-user
 	@command -v aarch64-linux-gnu-gcc qemu-aarch64-static >/dev/null || { echo "skipped: sudo apt install gcc-aarch64-linux-gnu qemu-user-static"; exit 0; }; \
@@ -101,7 +110,7 @@ csrc-test-aarch64: ## the same for aarch64 under qemu-user
 	qemu-aarch64-static build/test_kernel_aarch64
 
 .PHONY: nightly
-nightly: $(VENV)/.dev csrc-test csrc-test-aarch64 ## the tests with many more and new examples, and on whole machines
+nightly: $(VENV)/.dev csrc-test csrc-test-threads csrc-test-aarch64 ## the tests with many more and new examples, and on whole machines
 	LOCAGEN_NIGHTLY=1 $(BIN)/python -m pytest
 	PYTHONPATH=. $(BIN)/python tests/mavlink/fuzz.py --inputs 10000000
 	$(MAKE) deb-test arm-test vm-test
@@ -132,6 +141,7 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(BIN)/python bench/bench_instructions.py
 	$(BIN)/python bench/bench_steered.py
 	$(BIN)/python bench/bench_pipeline.py
+	$(BIN)/python bench/bench_daemon.py
 	$(BIN)/python bench/bench_framer.py
 	$(BIN)/python bench/bench_accuracy.py --trials 100
 	$(BIN)/python bench/bench_detection.py

@@ -63,12 +63,14 @@ GROUND = {
     "models",
     "framing",
     "resampling",
+    "sampleclock",
     "alignment",
     "files",
     "jsonl",
     "poses",
     "highpass",
     "gone",
+    "memory",
 }
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
@@ -80,10 +82,11 @@ ABOVE = {
     "restarts": set(),
     "journald": set(),
     "store": GROUND | {"sightings"},
-    "export": GROUND,
-    "sightings": GROUND | {"export"},
+    "export": GROUND | {"sightings"},
+    "sightings": GROUND,
     "fusion": GROUND | {"stages"},
     "notify": set(),
+    "stopping": set(),
     "mavproxy_locagen": GROUND | {"mavlink"},  # loaded by MAVProxy alone
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},

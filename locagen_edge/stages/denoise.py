@@ -188,6 +188,8 @@ class MaskStream:
         self._mics = mics
         self.noise = NoiseSpectrum(mics, forget_s * RATE_HZ / STEP)
         self._earliest = EARLIEST_S * RATE_HZ / STEP
+        self.power: F64 = np.zeros((mics, 0, BINS + 1))
+        """(mics, spectra, bins) of the last chunks"""
         self.reset()
 
     def reset(self) -> None:
@@ -205,9 +207,10 @@ class MaskStream:
         """
         long = np.concatenate([self._held, sound], axis=1)
         self._held = long[:, -(WINDOW - STEP) :]
-        pieces = np.lib.stride_tricks.sliding_window_view(long, WINDOW, axis=1)[:, ::STEP]
+        ends = range(WINDOW, long.shape[1] + 1, STEP)
+        pieces = np.stack([long[:, end - WINDOW : end] for end in ends], axis=1)
         spectra = np.fft.rfft(pieces * self._taper, axis=2)
-        power = np.square(spectra.real) + np.square(spectra.imag)
+        self.power = power = np.square(spectra.real) + np.square(spectra.imag)
         at = range(0, power.shape[1], CHUNK // STEP)
         return spectra, np.concatenate([self._mask(power[:, k : k + CHUNK // STEP]) for k in at])
 
@@ -266,9 +269,8 @@ class MaskDenoiser:
             self._stream.reset()
             self._masks[:] = 1.0
             self._power[:] = 0.0
-        spectra, mask = self._stream(sound)
-        power = np.square(spectra.real) + np.square(spectra.imag)
-        self._ended = power
+        _, mask = self._stream(sound)
+        self._ended = power = self._stream.power
         self._masks = np.concatenate([self._masks, mask])[-len(self._masks) :]
         self._power = np.concatenate([self._power, power.mean(axis=0)])[-len(self._power) :]
         # mask k belongs to the spectrum LOOKAHEAD before: the frame's first ones have theirs

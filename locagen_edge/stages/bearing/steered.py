@@ -101,6 +101,7 @@ class SteeredLocator:
         self._begin_anew()
         self._onsets = Onsets(self._hop_s)
         self._scores = [0.0 for _ in self._spans_s]
+        self._ratios = [0.0 for _ in self._spans_s]  # how those stand out
         self._strange = [False for _ in self._spans_s]
         self._strange_hops = 0
         self._loud_hops_ago: int | None = None
@@ -141,14 +142,15 @@ class SteeredLocator:
         if elapsed_s > LAG_S:
             self._onsets.forget()
         found = [self._heard(span, elapsed_s) for span in range(len(self._spans_s))]
+        self._ratios = [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
         if self._to_learn > 0:
             return (no_bearing(NAME),)
         self._end_of_a_loud_call()
-        return self._best(found) or (no_bearing(NAME, Evidence(min(max(self._ratios()), MEANING), 0.0)),)
+        return self._best(found) or (no_bearing(NAME, Evidence(min(max(self._ratios), MEANING), 0.0)),)
 
     def _best(self, found: list[list[Source]]) -> tuple[Bearing, ...]:
         """Of the spans: the frame where that is a call by itself, else whichever stands out more."""
-        ratios = self._ratios()
+        ratios = self._ratios
         order = sorted(range(len(found)), key=lambda span: -ratios[span])
         if ratios[0] >= self._least_ratio:
             order = [0, *order]
@@ -168,7 +170,7 @@ class SteeredLocator:
 
     def _end_of_a_loud_call(self) -> None:
         """Who was heard frame by frame and is not any more has stopped: the average begins anew."""
-        if self._ratios()[0] >= self._least_ratio:
+        if self._ratios[0] >= self._least_ratio:
             self._loud_hops_ago = 0
         elif self._loud_hops_ago is not None:
             self._loud_hops_ago += 1
@@ -177,10 +179,6 @@ class SteeredLocator:
                 for span, span_s in enumerate(self._spans_s):
                     if span_s > 0.0:
                         self._search.hear(1.0, span)
-
-    def _ratios(self) -> list[float]:
-        """How the best score of each span stands out."""
-        return [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
 
     def _heard(self, span: int, elapsed_s: float) -> list[Source]:
         """The callers in one span; none where the noise alone is as good a reason."""
@@ -194,11 +192,12 @@ class SteeredLocator:
         scores: F32 = self._search.map(span)
         if span == 0:
             self._onsets.hear(scores)
-        self._scores[span] = max(float(scores.max()), sources[0].score if sources else 0.0)
+        best = float(scores.max())
+        self._scores[span] = max(best, sources[0].score if sources else 0.0)
         self._strange[span] = False
         if not sources:
             return []
-        if sources[0].contrast < LOUDER * sources[0].score or scores.min() > FLAT * scores.max():
+        if sources[0].contrast < LOUDER * sources[0].score or scores.min() > FLAT * best:
             self._scores[span], self._strange[span] = 0.0, True
             return []
         least = max(SECOND * sources[0].score, self._least_ratio * self._usual[span].level)
@@ -253,7 +252,8 @@ class SteeredLocator:
         seen = arcs @ self._spread_m2 @ arcs.T
         # on the very horizon the second order is left: 1 - cos(error) is what the positions are off by
         seen[1, 1] += 0.5 * self._tolerance * seen[0, 0]
-        scale = self._tolerance_m / math.sqrt(max(float(np.linalg.det(seen)), 1e-18))
+        determinant = float(seen[0, 0] * seen[1, 1] - seen[0, 1] * seen[1, 0])
+        scale = self._tolerance_m / math.sqrt(max(determinant, 1e-18))
         return scale * math.sqrt(seen[1, 1]) / level, scale * math.sqrt(seen[0, 0])
 
     def likeliest(self, span: int = 0) -> Bearing:
@@ -290,7 +290,7 @@ class SteeredLocator:
 
     def _watch(self, call: bool) -> None:
         """What the noise's scores are, put aside until it is sure that they are the noise's."""
-        self._since_lag.append(max(self._ratios()))
+        self._since_lag.append(max(self._ratios))
         self._quiet_hops = 0 if call else self._quiet_hops + 1
         quiet = self._quiet_hops * self._hop_s > PAUSE_S  # a call fades out, and its pauses are no noise
         for span in range(len(self._spans_s)):
