@@ -33,7 +33,10 @@ from locagen_edge.errors import (
     StorageError,
 )
 from locagen_edge.geometry import compass_deg
+from locagen_edge.journald import formatter
 from locagen_edge.memory import one_arena
+from locagen_edge.notify import notify
+from locagen_edge.restarts import forget, put_off_s
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
 from locagen_edge.types import Estimate, Frame, Position, Track
 
@@ -55,7 +58,9 @@ TYPES = ("start", "stop", "bearing", "call", "sighting", "fault", "link", "sourc
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `locagen-edge`."""
     arguments = _parser().parse_args(argv)
-    logging.basicConfig(level=logging.INFO, format="%(levelname).1s %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(formatter(sys.stderr))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     if sys.stdout is None:  # started with it closed
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -308,6 +313,10 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    # where the service manager keeps it for us, from one start to the next
+    notes = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    if notes:
+        _put_off(Path(notes))
     one_arena()
     settings = _settings(arguments)
     callers, recorder = _callers(arguments), None
@@ -320,7 +329,19 @@ def _run(arguments: argparse.Namespace) -> int:
             recorder = Recorder(arguments.record, settings)
             ending.callback(recorder.close)
         asyncio.run(_serve(settings, arguments.seconds, recorder, callers, quiet=arguments.quiet))
+    if notes:
+        forget(Path(notes))
     return 0
+
+
+def _put_off(notes: Path) -> None:
+    """Waits where start after start has failed. SIGTERM still ends it at once."""
+    wait_s = put_off_s(notes, time.monotonic())
+    if wait_s:
+        text = f"failed again and again: waiting for {wait_s:.0f} s"
+        logging.warning("%s", text)
+        notify(STATUS=text)
+        time.sleep(wait_s)
 
 
 async def _serve(

@@ -69,6 +69,7 @@ GROUND = {
     "jsonl",
     "poses",
     "highpass",
+    "gone",
     "memory",
 }
 ABOVE = {
@@ -78,6 +79,8 @@ ABOVE = {
     "mavlink": GROUND,
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
+    "restarts": set(),
+    "journald": set(),
     "store": GROUND | {"sightings"},
     "export": GROUND | {"sightings"},
     "sightings": GROUND,

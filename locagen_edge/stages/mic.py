@@ -31,6 +31,7 @@ import soundfile
 from locagen_edge.alignment import Aligner
 from locagen_edge.errors import SourceError, SourceHungError
 from locagen_edge.framing import CLIPPED_SHARE, FULL_SCALE, Framer, Tap, in_real_time
+from locagen_edge.gone import close_gone
 from locagen_edge.jsonl import Record, read
 from locagen_edge.poses import Poses, pose_of
 from locagen_edge.resampling import Resampler
@@ -377,6 +378,8 @@ def _opened(sd: ModuleType, settings: Settings) -> Iterator[InputStream]:
             )
             raise SourceError(message) from error
         raise SourceError(f"{_label(settings)}: {_reason(error)}") from error
+    finally:
+        close_gone()
 
 
 # PortAudio's packed 24 bits have no dtype: it shifts them up into 32, where numpy reads them
