@@ -105,14 +105,20 @@ def test_a_sound_server_gives_every_row_once_and_in_order(sound_server, channels
         channel_map=channel_map,
         **UNTOUCHED,
     )
-    # the players' first rows may come after silence; ever after no row is missing
-    first = None
+    # the player's first rows come after silence, and others may where the machine is busy: that silence is the
+    # server's own; between it no row is missing
+    whole, before = 0, None
     for frame in found["frames"]:
+        assert frame["overruns"] == 0
+        if not np.any(frame["samples"], axis=0).all():
+            before = None
+            continue
         row = rows_of(frame, channel_map)
         assert (np.diff(row) % ROWS == 1).all()
-        assert frame["overruns"] == 0
-        first = row[0] - frame["start"] if first is None else first
-        assert (row[0] - frame["start"] - first) % ROWS == 0
+        shift = row[0] - frame["start"]
+        assert before is None or (shift - before) % ROWS == 0
+        whole, before = whole + 1, shift
+    assert whole >= 3
     assert found["closing_s"] < 0.5
 
 
