@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from locagen_edge.files import write
 from locagen_edge.lab.denoise.bearings import wilson
-from locagen_edge.lab.denoise.evaluate import CLASS_SNRS_DB, HELP
+from locagen_edge.lab.denoise.evaluate import CLASS_SNRS_DB, HELP, WORSE_DB
 from locagen_edge.lab.denoise.peers import spectra_of
 from locagen_edge.lab.plots import draw
 from locagen_edge.stages.denoise import RATE_HZ
@@ -75,7 +75,7 @@ def markdown(result: dict[str, Any]) -> str:
             f"{kind} at {snr} dB"
             for kind, row in data.items()
             for snr, x in row.items()
-            if x["improvement_db"] < 0
+            if x["improvement_db"] < WORSE_DB
         ]
         lines += [
             "", f"## {name}: SI-SDRi in dB by class and SNR", "",
