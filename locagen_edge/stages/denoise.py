@@ -58,7 +58,7 @@ FLOOR = 0.1
 they find nothing the output is the input, quieter, instead of what they make of noise."""
 SMOOTH_STEPS = 8
 """STEPs over which the share of power that is kept is averaged, 0.1 s"""
-WAVE_CALLS_DB = (-17.0, -13.0)
+WAVE_CALLS_DB = (-17.5, -13.5)
 """Share of its input's power that the waveform network keeps, without and with a call. Of recorded rotors
 alone it keeps -26 dB, for moments up to -12; of calls as loud as they -11 dB and more."""
 MASK_CALLS_DB = (2.0, 4.0)
