@@ -9,7 +9,7 @@ override DESTDIR := $(abspath $(DESTDIR))
 endif
 BIN    := $(VENV)/bin
 CFLAGS_C := -std=gnu11 -Wall -Wextra -Werror -fno-math-errno -fno-trapping-math
-KERNEL_C := $(filter-out csrc/test_kernel.c, $(wildcard csrc/*.c))
+KERNEL_C := $(filter-out csrc/test_%.c, $(wildcard csrc/*.c))
 KERNEL := $(wildcard csrc/*.c csrc/*.h) csrc/build_kernel.py setup.py pyproject.toml \
     locagen_edge/mavlink/locagen.xml locagen_edge/mavlink/build_dialect.py
 SYSTEMD_DIR := /lib/systemd/system
@@ -62,8 +62,9 @@ $(VENV)/.flight: $(KERNEL)
 # --- for developers
 
 .PHONY: test
-test: $(VENV)/.dev csrc-test csrc-test-aarch64 ## sets up and runs all tests
+test: $(VENV)/.dev csrc-test csrc-test-threads csrc-test-aarch64 ## sets up and runs all tests
 	$(call need,libasound2-dev,tests with a virtual sound card)
+	$(call need,pulseaudio pulseaudio-utils libasound2-plugins,tests with a sound server)
 	$(BIN)/python -m pytest
 
 .PHONY: check
@@ -94,6 +95,14 @@ build/test_kernel: csrc/test_kernel.c $(KERNEL_C) $(wildcard csrc/*.h)
 	@mkdir -p build
 	$(CC) $(CFLAGS_C) -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -Icsrc -o $@ csrc/test_kernel.c $(KERNEL_C) -lm
 
+.PHONY: csrc-test-threads
+csrc-test-threads: build/test_threads ## states of their own in threads of their own, under TSan
+	./build/test_threads
+
+build/test_threads: csrc/test_threads.c $(KERNEL_C) $(wildcard csrc/*.h)
+	@mkdir -p build
+	$(CC) $(CFLAGS_C) -O1 -g -fsanitize=thread -Icsrc -o $@ csrc/test_threads.c $(KERNEL_C) -lm -lpthread
+
 .PHONY: csrc-test-aarch64
 csrc-test-aarch64: ## the same for aarch64 under qemu-user
 	@command -v aarch64-linux-gnu-gcc qemu-aarch64-static >/dev/null || { echo "skipped: sudo apt install gcc-aarch64-linux-gnu qemu-user-static"; exit 0; }; \
@@ -101,16 +110,38 @@ csrc-test-aarch64: ## the same for aarch64 under qemu-user
 	qemu-aarch64-static build/test_kernel_aarch64
 
 .PHONY: nightly
-nightly: $(VENV)/.dev csrc-test csrc-test-aarch64 ## the tests with many more and new examples
+nightly: $(VENV)/.dev csrc-test csrc-test-threads csrc-test-aarch64 ## the tests with many more and new examples, and on whole machines
 	LOCAGEN_NIGHTLY=1 $(BIN)/python -m pytest
 	PYTHONPATH=. $(BIN)/python tests/mavlink/fuzz.py --inputs 10000000
+	$(MAKE) deb-test arm-test vm-test
+
+# $(call deb,ARCHITECTURE): the package's file, as it is named by the one place of the version.
+deb = build/deb/locagen-edge_$(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' locagen_edge/__init__.py)_$(1).deb
+
+.PHONY: vm-test
+vm-test: deb-arm64 ## the service under systemd on an emulated board: crash, hang, card pulled, limits, stop
+	$(call need,qemu-system-arm mmdebstrap cpio,the emulated board)
+	$(BIN)/python tests/vm/vm.py $(call deb,arm64)
+
+.PHONY: arm-test
+arm-test: deb-arm64 ## replay on aarch64 under qemu-user, beside this machine's
+	$(call need,qemu-user-static mmdebstrap,replay on aarch64)
+	$(BIN)/python tests/arm/replay.py $(call deb,arm64)
+
+.PHONY: deb-test
+deb-test: deb-native ## as root: the package in a clean Debian, from installation to purge
+	$(call need,mmdebstrap,a clean Debian)
+	$(BIN)/python tests/deb/install.py $(call deb,$(shell dpkg --print-architecture))
 
 .PHONY: bench
 bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(call need,libfftw3-dev,comparing with FFTW)
+	$(call need,qemu-user mmdebstrap gcc-aarch64-linux-gnu,counting instructions of aarch64)
 	$(BIN)/python bench/bench_kernel.py
+	$(BIN)/python bench/bench_instructions.py
 	$(BIN)/python bench/bench_steered.py
 	$(BIN)/python bench/bench_pipeline.py
+	$(BIN)/python bench/bench_daemon.py
 	$(BIN)/python bench/bench_framer.py
 	$(BIN)/python bench/bench_accuracy.py --trials 100
 	$(BIN)/python bench/bench_detection.py
@@ -136,6 +167,16 @@ paper: $(VENV)/.dev ## repeats the paper's experiments, into paper-report/ (some
 	$(BIN)/locagen-lab paper --out paper-report
 
 # --- the service
+
+.PHONY: deb deb-native deb-arm64
+deb: deb-native deb-arm64 ## Debian packages for this machine and for arm64, into build/deb/
+
+deb-native: $(VENV)/.dev
+	$(BIN)/python deb/build.py
+
+deb-arm64: $(VENV)/.dev
+	$(call need,gcc-aarch64-linux-gnu,cross-compiling the kernel)
+	$(BIN)/python deb/build.py --architecture arm64
 
 .PHONY: install
 install: ## as root: program, unit, user and sample settings; DESTDIR is honoured

@@ -6,7 +6,8 @@ The pipeline as it flies, with the default settings. Noise alone: streams of 5 m
 10 s (of learning) are told apart; a false call is one that begins. Calls: one of 1 s, after 14 s of noise,
 found when a frame of it is taken for a call; the onset as told with the last such frame; the error of the
 track then, and of the last bearing of all calls (a guess, 90 degrees, where there is none); sigma: share of
-the bearings in calls within 1 and 2 of their sigmas.
+the bearings in calls within 1 and 2 of their sigmas. The microphones stand where the settings say to within
+`array.tolerance_m`, as those sigmas suppose.
 """
 
 from __future__ import annotations
@@ -83,6 +84,7 @@ def false_calls(name: str, minutes: float, usual: F64) -> dict[str, float]:
 def called(kind: str, positions: F64, rng: np.random.Generator) -> tuple[F64, float]:
     """(mics, samples) of a call from somewhere below, and its azimuth."""
     call = CALLS[kind](round(CALL_S * RATE), RATE, 0.48 * RATE, rng)
+    positions = positions + rng.normal(0.0, DEFAULT.array.tolerance_m, positions.shape)
     call[:FADE] *= np.linspace(0.0, 1.0, FADE)
     call[-FADE:] *= np.linspace(1.0, 0.0, FADE)
     azimuth, elevation = rng.uniform(-math.pi, math.pi), math.radians(rng.uniform(-60.0, -10.0))

@@ -31,7 +31,7 @@ from locagen_edge.files import write
 from locagen_edge.geometry import MicArray, wrap
 from locagen_edge.settings import Settings, sample
 from locagen_edge.stages.correlation import Correlator
-from locagen_edge.stages.faults import symptoms
+from locagen_edge.stages.faults import alone
 from locagen_edge.stages.mic import wav_frames
 from locagen_edge.stages.tdoa import PeakPicker
 from locagen_edge.types import F64, Correlation, Tdoa
@@ -89,7 +89,7 @@ def hear(path: Path, settings: Settings, margin: float) -> Heard:
         frames += 1
         correlation = correlate(frame)
         tdoa = pick(correlation)
-        wrong = symptoms(frame, correlation, tdoa, misfit=0.0)  # positions are what is asked for
+        wrong, _ = alone(frame, correlation)  # where they stand is what is asked for
         faults.update(wrong)
         troughs.append(_trough(correlation))
         if not wrong and np.all(np.isfinite(tdoa.delay_s)):

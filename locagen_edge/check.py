@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from locagen_edge.errors import LocagenError, SourceHungError
+from locagen_edge.framing import Losses
 from locagen_edge.mavlink.component import Component, Status
 from locagen_edge.mavlink.link import Link, parse
 from locagen_edge.mavlink.parameters import kept
@@ -24,6 +25,14 @@ Finding = tuple[bool, str, str]
 
 LEAST_S = 1.0
 """A fault has to last for most of a second before it counts as one."""
+
+NOT_JUDGED = (
+    "no sound was common to all microphones: order, sign and spacing are not judged; "
+    "clap or talk while this runs"
+)
+FASTEST_PPM = 500.0
+"""Crystals err by 100 ppm at most; a device that misses its rate by more is not of the rate it says."""
+WRONG_CLOCK = ": no crystal errs so much; does it resample, or lose sound?"
 
 ALIVE = Status(hearing=True, track=None, snr_db=0.0, faults=())
 
@@ -82,7 +91,7 @@ def _models(settings: Settings) -> Iterator[Finding]:
 
 async def _listen(settings: Settings, pipeline: Pipeline, seconds: float) -> list[Finding]:
     """What is wrong in any frame. Raises `SourceHungError`: after it only the end of the process helps."""
-    frames, overruns, level_dbfs = 0, 0, 0.0
+    frames, losses, level_dbfs = 0, Losses(), 0.0
     faults: set[str] = set()
     end = math.inf  # counted from the first frame: opening a device takes its time
     try:
@@ -93,7 +102,7 @@ async def _listen(settings: Settings, pipeline: Pipeline, seconds: float) -> lis
                 faults.update(estimate.faults)
                 level_dbfs = estimate.detection.level_dbfs
                 frames += 1
-                overruns += frame.overruns
+                losses.count(frame)
                 if time.monotonic() >= end:
                     break
     except SourceHungError:
@@ -101,9 +110,20 @@ async def _listen(settings: Settings, pipeline: Pipeline, seconds: float) -> lis
     except LocagenError as error:
         return [(False, "microphones", str(error))]
     found = [(False, "microphones", fault) for fault in sorted(faults)]
-    if overruns:
-        found.append((False, "microphones", f"sound was lost {overruns} times: is the machine overloaded?"))
-    return found or [(True, "microphones", f"{frames} frames, level {level_dbfs:.0f} dBFS in the band")]
+    if frames and not pipeline.channels_judged:
+        found.append((True, "channels", NOT_JUDGED))
+    if losses.overruns:
+        found.append((False, "sound", f"{losses}: is the machine overloaded?"))
+    drift = losses.drift
+    if drift is not None:
+        wrong = abs(drift.ppm) > FASTEST_PPM + 3.0 * drift.sigma_ppm
+        asked = f"audio.device_rate_hz = {settings.audio.device_rate_hz}"
+        found.append(
+            (not wrong, "clock", f"{asked}, the device runs by {drift}{WRONG_CLOCK if wrong else ''}")
+        )
+    if not faults:
+        found.insert(0, (True, "microphones", f"{frames} frames, level {level_dbfs:.0f} dBFS in the band"))
+    return found
 
 
 async def _link(settings: Settings, name: str, guard: Guard, seconds: float) -> Finding:

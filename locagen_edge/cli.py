@@ -15,7 +15,6 @@ import math
 import os
 import shutil
 import signal
-import statistics
 import sys
 import time
 from collections import Counter, deque
@@ -24,7 +23,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from locagen_edge import __version__
+from locagen_edge import __version__, stopping
 from locagen_edge.errors import (
     CalibrationError,
     ExportError,
@@ -34,12 +33,17 @@ from locagen_edge.errors import (
     StorageError,
 )
 from locagen_edge.geometry import compass_deg
+from locagen_edge.journald import formatter
+from locagen_edge.memory import one_arena
+from locagen_edge.notify import notify
+from locagen_edge.restarts import forget, put_off_s
 from locagen_edge.settings import DEFAULT_PATH, Settings, load
 from locagen_edge.types import Estimate, Frame, Position, Track
 
 if TYPE_CHECKING:
     from locagen_edge.daemon import Daemon
     from locagen_edge.export import Callers, Told
+    from locagen_edge.framing import Losses
     from locagen_edge.jsonl import Record
     from locagen_edge.mavlink.links import Links
     from locagen_edge.store.recorder import Progress, Recorder
@@ -54,11 +58,15 @@ TYPES = ("start", "stop", "bearing", "call", "sighting", "fault", "link", "sourc
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `locagen-edge`."""
     arguments = _parser().parse_args(argv)
-    logging.basicConfig(level=logging.INFO, format="%(levelname).1s %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(formatter(sys.stderr))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     if sys.stdout is None:  # started with it closed
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal without a degree sign is no reason to stop
+    if arguments.command not in (_run, _record):  # these two run until they are stopped
+        stopping.with_code(128 + signal.SIGTERM)
     try:
         code = arguments.command(arguments)
     except SourceHungError as error:
@@ -162,6 +170,11 @@ def _parser() -> argparse.ArgumentParser:
         "--output", type=Path, metavar="DIR", help="where the parts go (default: record.directory)"
     )
     record.add_argument("--seconds", type=_positive, metavar="N", help="stop after N seconds of sound")
+    record.add_argument(
+        "--poses",
+        action="store_true",
+        help="keep the vehicle's poses too, from mavlink.link: not while `run` has that link",
+    )
 
     log = command(
         "log",
@@ -300,6 +313,11 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    # where the service manager keeps it for us, from one start to the next
+    notes = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    if notes:
+        _put_off(Path(notes))
+    one_arena()
     settings = _settings(arguments)
     callers, recorder = _callers(arguments), None
     with contextlib.ExitStack() as ending:
@@ -311,7 +329,19 @@ def _run(arguments: argparse.Namespace) -> int:
             recorder = Recorder(arguments.record, settings)
             ending.callback(recorder.close)
         asyncio.run(_serve(settings, arguments.seconds, recorder, callers, quiet=arguments.quiet))
+    if notes:
+        forget(Path(notes))
     return 0
+
+
+def _put_off(notes: Path) -> None:
+    """Waits where start after start has failed. SIGTERM still ends it at once."""
+    wait_s = put_off_s(notes, time.monotonic())
+    if wait_s:
+        text = f"failed again and again: waiting for {wait_s:.0f} s"
+        logging.warning("%s", text)
+        notify(STATUS=text)
+        time.sleep(wait_s)
 
 
 async def _serve(
@@ -355,8 +385,7 @@ async def _serve(
         return open_source(settings, recorder)
 
     daemon = Daemon(settings, on_second=each_second, on_estimate=each_estimate, sources=source)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, daemon.stop)
+    stopping.calls(daemon.stop)
     if not quiet:
         links = ", ".join(settings.mavlink.link)
         print(
@@ -376,7 +405,7 @@ async def _serve(
     if not quiet:
         c = daemon.counters
         print(
-            f"{c.estimates} frames, {c.dropped} dropped, {c.overruns} overruns, "
+            f"{c.estimates} frames, {c.dropped} dropped, {c.sound}, "
             f"{c.source_failures} source failures; sent {_counts(daemon.component.sent)}, "
             f"{daemon.links.dropped} of them lost"
         )
@@ -440,7 +469,7 @@ class LiveLine:
         else:
             parts.append(describe(daemon.estimate))
             if latency:
-                parts.append(f"{1e3 * statistics.median(latency):.1f} ms")
+                parts.append(f"{1e3 * sorted(latency)[len(latency) // 2]:.1f} ms")
         parts.append(self._links(daemon.links, news))
         print("  ".join(parts), flush=True)
 
@@ -643,7 +672,7 @@ def _record(arguments: argparse.Namespace) -> int:
     directory = arguments.output or Path(settings.record.directory)
     recorder = Recorder(directory, settings)
     try:
-        overruns = asyncio.run(_keep(settings, recorder, arguments.seconds))
+        losses = asyncio.run(_keep(settings, recorder, arguments.seconds, poses=arguments.poses))
     finally:
         if sys.stderr.isatty():
             print(file=sys.stderr)
@@ -652,23 +681,26 @@ def _record(arguments: argparse.Namespace) -> int:
         raise StorageError(recorder.failure)
     done = recorder.progress()
     print(
-        f"{done.seconds:.1f} s in {directory}, {overruns} overruns, {done.lost} blocks lost; "
+        f"{done.seconds:.1f} s in {directory}, {losses}, {done.lost} blocks not written; "
         f"hear it with: locagen-edge replay {directory}"
     )
     return 0
 
 
-async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -> int:
-    """Reads the source, which fills the recorder, until the time is over or a signal comes. Overruns."""
+async def _keep(settings: Settings, recorder: Recorder, seconds: float | None, *, poses: bool) -> Losses:
+    """Reads the source, which fills the recorder, until the time is over or a signal comes."""
+    from locagen_edge.framing import Losses
+    from locagen_edge.mavlink.posefeed import posefeed
+    from locagen_edge.poses import record_of
     from locagen_edge.sources import open_source
 
-    stopping = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stopping.set)
-    stop = asyncio.create_task(stopping.wait())
-    overruns, second = 0, 0
-    async with contextlib.aclosing(open_source(settings, recorder)) as source:
+    enough = asyncio.Event()
+    stopping.calls(enough.set)
+    stop = asyncio.create_task(enough.wait())
+    losses, second = Losses(), 0
+    async with contextlib.AsyncExitStack() as ending:
+        known = await ending.enter_async_context(posefeed(settings)) if poses else None
+        source = await ending.enter_async_context(contextlib.aclosing(open_source(settings, recorder)))
         while not recorder.failure:
             coming = asyncio.ensure_future(anext(source, None))
             await asyncio.wait([coming, stop], return_when=asyncio.FIRST_COMPLETED)
@@ -679,18 +711,21 @@ async def _keep(settings: Settings, recorder: Recorder, seconds: float | None) -
             frame = coming.result()
             if frame is None:  # a recording's end
                 break
-            overruns += frame.overruns
+            losses.count(frame)
+            pose = known.at(frame.middle_ns) if known is not None else None
+            if pose is not None:
+                recorder.note(record_of(pose))
             heard_s = (frame.start + frame.samples.shape[1]) / frame.rate_hz
             if seconds is not None and heard_s >= seconds:
                 break
             if int(heard_s) > second:
                 second = int(heard_s)
-                _show(recorder.progress(), overruns)
+                _show(recorder.progress(), losses)
     stop.cancel()
-    return overruns
+    return losses
 
 
-def _show(progress: Progress, overruns: int) -> None:
+def _show(progress: Progress, losses: Losses) -> None:
     """One line that is written over, on a terminal: what there is, and the level of each channel."""
     if not sys.stderr.isatty():
         return
@@ -698,7 +733,7 @@ def _show(progress: Progress, overruns: int) -> None:
     peak = _dbfs(max(progress.peak, default=0.0))
     text = (
         f"{progress.seconds:7.0f} s  {progress.name}  {progress.kept_bytes / 1e6:.1f} MB  "
-        f"rms {levels} dBFS, peak {peak:.0f}  {overruns} overruns, {progress.lost} lost"
+        f"rms {levels} dBFS, peak {peak:.0f}  {losses}, {progress.lost} blocks not written"
     )
     print(f"\r{text[: shutil.get_terminal_size().columns - 1]}\033[K", end="", file=sys.stderr, flush=True)
 
@@ -776,7 +811,8 @@ def _devices(_: argparse.Namespace) -> int:
         print("no capture device: plug one in, and see `arecord -l` for what the kernel knows")
     for device in found:
         rate = f"default {device.default_rate_hz:g} Hz"
-        print(f"{device.name!r}: {device.channels} channels, {rate} ({device.host_api})")
+        stable = f", audio.device = {device.stable_name!r}" if device.stable_name != device.name else ""
+        print(f"{device.name!r}: {device.channels} channels, {rate} ({device.host_api}){stable}")
     return 0
 
 

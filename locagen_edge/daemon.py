@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from locagen_edge.errors import LinkError, LocagenError, SourceError, SourceHungError
+from locagen_edge.framing import Losses
 from locagen_edge.mavlink.component import Component, Hands, Status, is_confirmed
 from locagen_edge.mavlink.computer import Computer
 from locagen_edge.mavlink.identity import machine_uid
@@ -60,8 +61,8 @@ class Counters:
     estimates: int = 0
     dropped: int = 0
     """frames that the queue had no room for"""
-    overruns: int = 0
-    """times that the source lost sound"""
+    sound: Losses = field(default_factory=Losses)
+    """what the source lost"""
     source_failures: int = 0
     latency_s: list[float] = field(default_factory=list)
     """of the last second: from a frame's last sample to its estimate"""
@@ -101,7 +102,10 @@ class Daemon:
         self._told: BaseException | None = None
         self._links_up = 0
         self._said_s = -math.inf
+        self._sent_s = -math.inf
         self._save_s = math.inf
+        self._told_losses = 0, 0
+        self._tell_losses_s = -math.inf
         self._complaints: tuple[str, ...] = ()
         self._applied = settings
         self._applying: asyncio.Future[None] | None = None
@@ -228,10 +232,11 @@ class Daemon:
 
     async def _read_source(self) -> None:
         """Frames into the queue until the source ends. Raises `SourceError` where it fails or stalls."""
+        self.counters.sound.reopened()
         async with contextlib.aclosing(self._sources(self.settings)) as source:
             async for frame in source:
                 self.counters.frames += 1
-                self.counters.overruns += frame.overruns
+                self.counters.sound.count(frame)
                 if self.source_fault:
                     log.warning("sound again")
                     self.source_fault = ""
@@ -254,15 +259,14 @@ class Daemon:
             estimate = await loop.run_in_executor(self._executor, self.pipeline.process, frame, pose)
             self.estimate, self._middle_ns = estimate, frame.middle_ns
             self._working = False
+            self._heard_s = time.monotonic()
+            self.counters.estimates += 1
+            self.counters.latency_s.append((time.monotonic_ns() - frame.end_ns) * 1e-9)
+            self._send()  # first: all else can wait
             if self.black_box is not None:
                 self.black_box.hear(frame, estimate)
             if self._on_estimate is not None:
                 self._on_estimate(frame, estimate)
-            self._heard_s = time.monotonic()
-            self.counters.estimates += 1
-            end_ns = 2 * frame.middle_ns - frame.t_ns
-            self.counters.latency_s.append((time.monotonic_ns() - end_ns) * 1e-9)
-            self._send()
             self._tell_ready()
 
     # --- what is asked over MAVLink: none of it waits
@@ -330,6 +334,7 @@ class Daemon:
     def _send(self) -> None:
         """Sends what is due. While the link is down nothing is: it would be said to nobody."""
         up, now_s = self.links.up, time.monotonic()
+        self._sent_s = now_s
         # Who has just come up has heard nothing; but one that flaps must not make all others hear it again.
         if up > self._links_up and (not self._links_up or now_s - self._said_s > SAY_AGAIN_S):
             self.component.say_again()
@@ -379,7 +384,8 @@ class Daemon:
         next_s = time.monotonic() + 1.0
         while True:
             await asyncio.sleep(TICK_S)
-            self._send()
+            if time.monotonic() - self._sent_s > TICK_S / 2.0:  # each frame sends what is due, too
+                self._send()
             for number in range(len(self.links.links)):
                 self._answer(number)
             if time.monotonic() < next_s:
@@ -387,6 +393,7 @@ class Daemon:
             next_s = max(next_s, time.monotonic() - 1.0) + 1.0  # after a suspension no second is made up for
             if self._on_second is not None:
                 self._on_second(self)
+            self._tell_losses()
             self._watch_network()
             self._keep_parameters()
             if self.hearing or self.source_fault:
@@ -403,8 +410,22 @@ class Daemon:
         return {
             "link": {"up": self.links.up == len(self.links.links), "error": self.links.last_error},
             "source": {"fault": self.source_fault},
-            "losses": {"frames": c.dropped, "overruns": c.overruns, "messages": self.links.dropped},
+            "losses": {
+                "frames": c.dropped,
+                "overruns": c.sound.overruns,
+                "messages": self.links.dropped,
+                "sound_s": round(c.sound.lost_s, 1),
+            },
         }
+
+    def _tell_losses(self) -> None:
+        """To the log, when there are more; not every second of a bad hour."""
+        c = self.counters
+        losses = c.dropped, c.sound.overruns
+        if losses == self._told_losses or time.monotonic() < self._tell_losses_s:
+            return
+        self._told_losses, self._tell_losses_s = losses, time.monotonic() + SAY_AGAIN_S
+        log.warning("since the start: %d frames dropped, %s", c.dropped, c.sound)
 
     def _watch_network(self) -> None:
         """Tells the log what the others do not: that they ignore us, or that one of them goes by our ids.
@@ -431,8 +452,9 @@ class Daemon:
         state = "listening" if self.component.listening else "told to stop listening"
         if not self.hearing:
             state = f"no sound: {self.source_fault or 'waiting'}"
-        losses = f"{c.dropped} dropped, {c.overruns} overruns, {self.links.dropped} messages lost"
+        losses = f"{c.dropped} dropped, {c.sound}, {self.links.dropped} messages lost"
         if self.black_box is not None and self.black_box.lost:
             losses += f", {self.black_box.lost} log records lost"
+        faults = list(self.estimate.faults) if self.hearing and self.estimate is not None else []
         down = [f"link down: {self.links.last_error}"] if self.links.last_error else []
-        return "; ".join([state, f"{c.estimates} frames, {losses}", *down, *self._complaints])
+        return "; ".join([state, *faults, f"{c.estimates} frames, {losses}", *down, *self._complaints])

@@ -15,7 +15,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,9 @@ from locagen_edge import geodesy
 from locagen_edge.errors import ExportError
 from locagen_edge.files import write
 from locagen_edge.geometry import compass_deg
+from locagen_edge.sightings import EPOCH
 from locagen_edge.types import Estimate, Pose, Position, Sighting, Track
 
-EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))
 """Semi-axes of the 95 % ellipse over those of 1-sigma: 2.45."""
 SIGMAS_95 = 1.96

@@ -11,11 +11,17 @@ import asyncio
 import time
 from collections.abc import AsyncGenerator, Callable, Generator
 from contextlib import closing
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from locagen_edge.types import F32, Array, Frame
+from locagen_edge.types import F32, Array, Drift, Frame
+
+FULL_SCALE = 0.999
+"""of 1.0: a converter that is driven beyond its end stays there"""
+CLIPPED_SHARE = 0.01
+"""of all samples, from which sound counts as clipped: single knocks on a microphone are none"""
 
 
 class Tap(Protocol):
@@ -83,6 +89,36 @@ class Framer:
         return self.origin_ns + round((sample - self._origin) * 1e9 / self._rate_hz)
 
 
+@dataclass
+class Losses:
+    """What of a source's sound is missing, and how its clock runs: counted frame by frame."""
+
+    overruns: int = 0
+    """times that sound was lost"""
+    lost_s: float = 0.0
+    """between the frames before and after: by these, by frames dropped unheard, while the source was away"""
+    drift: Drift | None = None
+    _ended_ns: int | None = None
+    _away: bool = False
+
+    def reopened(self) -> None:
+        """The next frame is the first of another opening."""
+        self._away = True
+
+    def count(self, frame: Frame) -> None:
+        """Takes each frame in order."""
+        if self._ended_ns is not None and (frame.overruns or self._away):
+            self.lost_s += max(frame.t_ns - self._ended_ns, 0) * 1e-9
+        self.overruns += frame.overruns
+        self._ended_ns, self._away = frame.end_ns, False
+        self.drift = frame.drift or self.drift
+
+    def __str__(self) -> str:
+        overruns = f"{self.overruns} overruns" if self.overruns != 1 else "1 overrun"
+        clock = f", clock {self.drift}" if self.drift is not None else ""
+        return f"{overruns}, {self.lost_s:.1f} s of sound lost{clock}"
+
+
 async def in_real_time(
     frames_from: Callable[[int], Generator[Frame, None, None]],
 ) -> AsyncGenerator[Frame, None]:
@@ -92,6 +128,5 @@ async def in_real_time(
     """
     with closing(frames_from(time.monotonic_ns())) as frames:
         for frame in frames:
-            end_ns = frame.t_ns + round(frame.samples.shape[1] * 1e9 / frame.rate_hz)
-            await asyncio.sleep(max(0.0, (end_ns - time.monotonic_ns()) * 1e-9))
+            await asyncio.sleep(max(0.0, (frame.end_ns - time.monotonic_ns()) * 1e-9))
             yield frame

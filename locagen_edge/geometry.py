@@ -50,6 +50,14 @@ def angles(u: F64) -> tuple[float, float]:
     return math.atan2(u[1], u[0]), math.atan2(-u[2], math.hypot(u[0], u[1]))
 
 
+def tangent(u: F64) -> F64:
+    """(2, 3): across a direction (3,), level with the horizon (clockwise) and towards the zenith."""
+    x, y, z = u.tolist()
+    flat = math.hypot(x, y)
+    a, b = (-y / flat, x / flat) if flat > 1e-9 else (0.0, 1.0)
+    return np.array([[a, b, 0.0], [b * z, -a * z, a * y - b * x]])
+
+
 def wrap(angle_rad: float) -> float:
     """The same angle within -pi (included) to pi (left out)."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi

@@ -50,6 +50,11 @@ class Pipeline:
         )
         self._last_ns: int | None = None
 
+    @property
+    def channels_judged(self) -> bool:
+        """Whether there has been a sound from which faults between channels can be told."""
+        return self._find_faults.judged
+
     def apply(self, settings: Settings) -> None:
         """New settings from the next frame on: call it between two frames.
 
@@ -89,6 +94,7 @@ class Pipeline:
             raise SourceError(f"a frame of shape {frame.samples.shape} came, settings say {self._shape}")
         elapsed_s = self._hop_s if self._last_ns is None else max(frame.t_ns - self._last_ns, 0) * 1e-9
         self._last_ns = frame.t_ns
+        heard = frame
         if self._denoise is not None:
             frame = self._denoise(frame)
         mask = self._mask(frame) if self._mask is not None else None
@@ -110,7 +116,7 @@ class Pipeline:
             bearing=bearings[0],
             detection=detection,
             track=tracks[0] if tracks else None,
-            faults=self._find_faults(frame, correlation, tdoa, elapsed_s),
+            faults=self._find_faults(heard, correlation, tdoa, elapsed_s),
             truth=frame.truth,
             tracks=tracks,
             pose=pose,

@@ -125,7 +125,9 @@ class AudioSettings:
         choices=("alsa", "wav", "sim"),
     )
     device: str = setting(
-        "", "ALSA: part of the device's name as `locagen-edge devices` prints it; empty: the default."
+        "",
+        "ALSA: the device's name, or a part of it, as `locagen-edge devices` prints it; or `hw:CARD=ID`, "
+        "which it prints too, and which stays whatever number the card is given. Empty: the default.",
     )
     device_rate_hz: int = setting(
         48000, "ALSA: the rate asked of the device.", unit="Hz", least=8000, most=192000
@@ -134,7 +136,9 @@ class AudioSettings:
         3, "ALSA: how many channels the device is opened with.", unit="channels", least=1, most=64
     )
     sample_format: str = setting(
-        "int16", "ALSA: how the device delivers samples.", choices=("int16", "float32")
+        "int16",
+        "ALSA: how the device delivers samples; `int24` for converters of 24 or 32 bits.",
+        choices=("int16", "int24", "float32"),
     )
     channel_map: tuple[int, ...] = setting(
         (0, 1, 2),
@@ -581,8 +585,9 @@ class DaemonSettings:
         unit="s", least=0.2, most=10,
     )  # fmt: skip
     backoff_s: float = setting(
-        10.0,
-        "Longest wait between two attempts to reopen a source; a link waits for 0.9 s at most.",
+        1.0,
+        "Longest wait between two attempts to reopen a source: with it a device that is plugged in again is "
+        "found within 2 s. A link waits for 0.9 s at most.",
         unit="s",
         least=0.1,
         most=600,

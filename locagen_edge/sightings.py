@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from locagen_edge.errors import ExportError
-from locagen_edge.export import EPOCH
 from locagen_edge.jsonl import Record
 from locagen_edge.types import Sighting
 
 TYPE = "sighting"
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 FIELDS = {field.name: field for field in dataclasses.fields(Sighting) if field.name != "t_ns"}
 NEEDED = {name for name, field in FIELDS.items() if field.default is dataclasses.MISSING}
 LIMITS = {"latitude_deg": 90.0, "longitude_deg": 360.0, "elevation_deg": 90.0}

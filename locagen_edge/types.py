@@ -31,6 +31,18 @@ class Truth:
     """whether the source sounds in this frame"""
 
 
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How a sound card's clock runs against the computer's monotonic one."""
+
+    ppm: float
+    """positive: the card is fast"""
+    sigma_ppm: float
+
+    def __str__(self) -> str:
+        return f"{self.ppm:+.0f} ±{max(self.sigma_ppm, 1.0):.0f} ppm"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """A piece of sound from all microphones."""
@@ -44,6 +56,10 @@ class Frame:
     """number of the first sample since the source was opened; frames overlap by the frame less the hop"""
     overruns: int = 0
     """times that sound was lost between the previous frame and this one's end"""
+    clipped: int = 0
+    """bit m set: microphone m stood at the device's full scale since the previous frame's end"""
+    drift: Drift | None = None
+    """of the device's clock, where it has one and it is known"""
     truth: Truth | None = None
     pose: Pose | None = None
     """of the vehicle at the middle, where a recording tells"""
@@ -54,6 +70,11 @@ class Frame:
     def middle_ns(self) -> int:
         """monotonic time of the middle"""
         return self.t_ns + round(len(self.samples[0]) * 0.5e9 / self.rate_hz)
+
+    @property
+    def end_ns(self) -> int:
+        """monotonic time of the end of the last sample"""
+        return self.t_ns + round(len(self.samples[0]) * 1e9 / self.rate_hz)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from alsa.card import VirtualCard, build
 from hypothesis import HealthCheck
 from hypothesis import settings as hypothesis_settings
 
@@ -32,3 +33,14 @@ def recordings() -> Path:
     if not (RECORDINGS / "MANIFEST.csv").is_file():
         pytest.skip(f"no recordings at {RECORDINGS}: set LOCAGEN_RECORDINGS to a folder with MANIFEST.csv")
     return RECORDINGS
+
+
+@pytest.fixture(scope="session")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The virtual sound card, compiled."""
+    return build(tmp_path_factory.mktemp("plugin"))
+
+
+@pytest.fixture
+def card(library: Path, tmp_path: Path) -> VirtualCard:
+    return VirtualCard(library, tmp_path)

@@ -270,7 +270,8 @@ def test_check_finds_all_well_with_the_default_scene():
     assert done.returncode == 0, done.stdout + done.stderr
     found = [line.split(":")[0] for line in done.stdout.splitlines()]
     assert [line.split()[0] for line in found] == ["ok"] * len(found)
-    assert {line.split()[1] for line in found} == {"settings", "models", "estimator", "microphones", "link"}
+    what = {line.split()[1] for line in found} - {"channels"}  # so short a time may hold no call
+    assert what == {"settings", "models", "estimator", "microphones", "link"}
 
 
 def test_check_says_what_is_wrong_and_exits_with_1(tmp_path):

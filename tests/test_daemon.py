@@ -31,7 +31,7 @@ from locagen_edge.mavlink import dialect, signing
 from locagen_edge.mavlink.framer import Framer
 from locagen_edge.mavlink.signing import Guard
 from locagen_edge.settings import Settings, from_table
-from locagen_edge.types import Frame, Pose
+from locagen_edge.types import Drift, Frame, Pose
 
 Sources = Callable[[Settings], AsyncGenerator[Frame, None]]
 
@@ -577,3 +577,26 @@ def test_mavsdk_hears_the_bearing_of_the_running_service(tmp_path):
             assert peer.messages("STATUSTEXT")[0]["fields"]["text"].startswith("Call heard")
 
     asyncio.run(test())
+
+
+def test_faults_and_the_cards_clock_are_in_the_status_and_a_fault_is_texted_once(ground):
+    settings = with_link(port_of(ground), bearing={"estimator": "far-field"})
+    plain = source(settings, pace_s=0.02)
+
+    async def inverted(s: Settings) -> AsyncGenerator[Frame, None]:
+        async for frame in plain(s):
+            samples = frame.samples * np.float32([[1], [-1], [1]])
+            yield Frame(samples, frame.rate_hz, frame.t_ns, frame.start, drift=Drift(12.3, 0.4))
+
+    fault = "microphone 1: inverted, its two wires are swapped"
+
+    async def test() -> None:
+        async with running(settings, sources=inverted) as daemon:
+            await until(lambda: f"listening; {fault}; " in daemon._in_words())
+            assert "0 overruns, 0.0 s of sound lost, clock +12 ±1 ppm" in daemon._in_words()
+            estimates = daemon.counters.estimates
+            await until(lambda: daemon.counters.estimates > estimates + 100)
+
+    asyncio.run(test())
+    texts = [m.text for m in messages(ground) if m.get_type() == "STATUSTEXT"]
+    assert texts.count(fault) == 1

@@ -325,7 +325,7 @@ def listen(sound: np.ndarray, noise_chunks: int) -> np.ndarray:
         spectra, mask = stream(sound[:, first : first + CHUNK].astype(np.float32))
         out.append(stream.cleaned(spectra, mask))
         if first < noise_chunks * CHUNK:
-            stream.learn(np.abs(spectra) ** 2)
+            stream.learn()
     return np.concatenate(out, axis=1)[:, MASK_DELAY:]
 
 

@@ -63,11 +63,14 @@ GROUND = {
     "models",
     "framing",
     "resampling",
+    "sampleclock",
     "alignment",
     "files",
     "jsonl",
     "poses",
     "highpass",
+    "gone",
+    "memory",
 }
 ABOVE = {
     **dict.fromkeys(GROUND, GROUND),
@@ -76,11 +79,14 @@ ABOVE = {
     "mavlink": GROUND,
     "pipeline": GROUND | {"stages"},
     "sources": GROUND,  # the sources themselves are imported by name, when they are chosen
+    "restarts": set(),
+    "journald": set(),
     "store": GROUND | {"sightings"},
-    "export": GROUND,
-    "sightings": GROUND | {"export"},
+    "export": GROUND | {"sightings"},
+    "sightings": GROUND,
     "fusion": GROUND | {"stages"},
     "notify": set(),
+    "stopping": set(),
     "mavproxy_locagen": GROUND | {"mavlink"},  # loaded by MAVProxy alone
     "calibration": GROUND,
     "calibrate": GROUND | {"stages", "calibration"},

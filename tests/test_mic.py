@@ -1,6 +1,6 @@
 """Microphones and recordings: every sample once and in order, faults in words, the clock kept.
 
-The ALSA tests go through the real PortAudio and ALSA libraries to a virtual card (tests/alsa).
+With the real libraries: tests/test_alsa.py.
 """
 
 import asyncio
@@ -13,15 +13,14 @@ import sys
 import numpy as np
 import pytest
 import soundfile
-from alsa.card import ROWS, VirtualCard, build, row_of
 
 from locagen_edge.errors import SourceError
+from locagen_edge.sampleclock import LOSS_S, SampleClock
 from locagen_edge.settings import from_table
+from locagen_edge.stages import mic
 from locagen_edge.stages.mic import (
-    LOSS_S,
     POLL_S,
     Device,
-    SampleClock,
     _choose,
     _Mailbox,
     capture,
@@ -402,6 +401,7 @@ def test_a_missing_portaudio_is_told():
 import sys, ctypes.util, asyncio, json
 ctypes.util.find_library = lambda name: None
 from locagen_edge.errors import SourceError
+from locagen_edge.sampleclock import LOSS_S, SampleClock
 from locagen_edge.settings import from_table
 from locagen_edge.sources import open_source
 from locagen_edge.stages.mic import devices
@@ -416,136 +416,27 @@ print(json.dumps(told))
     assert json.loads(run_python(code)) == ["PortAudio is missing: install the package libportaudio2"] * 2
 
 
-# --- ALSA, through the real libraries -----------------------------------------------------------------
+def test_a_card_is_found_by_its_id_whatever_its_number(tmp_path, monkeypatch):
+    """Two arrays of one make, which only the kernel's ids tell apart."""
+    twins = [Device(n, f"Array: USB Audio (hw:{n},0)", 4, 48_000.0, "ALSA") for n in (1, 2)]
+    monkeypatch.setattr(mic, "CARDS", tmp_path)
+    for number, name in ((1, "Array"), (2, "Array_1")):
+        (tmp_path / f"card{number}").mkdir()
+        (tmp_path / f"card{number}" / "id").write_text(f"{name}\n")
+    assert [device.stable_name for device in twins] == ["hw:CARD=Array,DEV=0", "hw:CARD=Array_1,DEV=0"]
+    for wanted, index in (("hw:CARD=Array_1", 2), ("hw:CARD=Array,DEV=0", 1), (twins[1].name, 2)):
+        assert _choose(twins, make(device=wanted)).index == index
+    with pytest.raises(SourceError, match='"hw:CARD=Array,DEV=1" is not there'):
+        _choose(twins, make(device="hw:CARD=Array,DEV=1"))
+    assert [device.stable_name for device in FOUND] == [device.name for device in FOUND]
 
 
-@pytest.fixture(scope="session")
-def library(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("plugin"))
-
-
-@pytest.fixture
-def card(library, tmp_path):
-    return VirtualCard(library, tmp_path)
-
-
-MAP = (2, 0, 3)
-
-
-def rows_of(frame):
-    """(mics, n) row numbers, which must agree between the microphones."""
-    rows = np.stack([row_of(s, channel) for s, channel in zip(frame["samples"], MAP, strict=True)])
-    assert (rows == rows[0]).all()
-    return rows[0]
-
-
-def assert_whole(frame):
-    """Every row once and in order."""
-    assert (np.diff(rows_of(frame)) % ROWS == 1).all()
-
-
-# Not int16 from a card of floats: PortAudio rounds there.
-@pytest.mark.parametrize(("real", "sample_format"), [(False, "int16"), (False, "float32"), (True, "float32")])
-def test_every_row_of_a_card_arrives_once_and_in_order(library, tmp_path, real, sample_format):
-    found = VirtualCard(library, tmp_path, real=real).play("listen", sample_format=sample_format)
-    first = rows_of(found["frames"][0])[0]
-    for k, frame in enumerate(found["frames"]):
-        assert_whole(frame)
-        assert (rows_of(frame)[0] - first) % ROWS == HOP * k == frame["start"]
-        assert frame["overruns"] == 0
-        assert found["before_ns"] < frame["t_ns"] < found["after_ns"]
-    assert found["closing_s"] < 0.5
-    assert found["opened"] == found["closed"]
-
-
-def test_a_card_at_48_khz_is_resampled(library, tmp_path):
-    card = VirtualCard(library, tmp_path, rate_hz=48_000)
-    found = card.play("listen", device_rate_hz=48_000)
-    frame = found["frames"][-1]
-    steps = np.diff(np.array(frame["samples"]))
-    # a ramp of one step a row climbs 4.8 steps a sample; a quarter of the frames holds a jump back
-    assert np.median(steps) == pytest.approx(4.8 / 32768, rel=0.01)
-
-
-def test_an_overrun_of_a_card_travels_and_no_frame_spans_it(card):
-    frames = card.play("overrun")["frames"]
-    assert sum(f["overruns"] for f in frames) == 1
-    for frame in frames:
-        assert_whole(frame)
-    at = next(k for k, f in enumerate(frames) if f["overruns"])
-    gap_rows = (rows_of(frames[at])[0] - rows_of(frames[0])[0]) % ROWS
-    gap_ns = frames[at]["t_ns"] - frames[0]["t_ns"]
-    # Rows that were lost still take their time. What the card loses between its stop and its start anew
-    # counts in time, not in rows: some ms.
-    assert gap_ns * 1e-5 == pytest.approx(gap_rows, abs=500)
-
-
-def test_a_silent_loss_of_a_card_is_an_overrun(card):
-    frames = card.play("skip")["frames"]
-    assert sum(f["overruns"] for f in frames) == 1
-    # the rows that were skipped took their time: 0.2 s, known to a few ms once the clock is set anew
-    rows = (rows_of(frames[-1])[0] - rows_of(frames[0])[0]) % ROWS
-    assert (frames[-1]["t_ns"] - frames[0]["t_ns"]) * 1e-5 == pytest.approx(rows, abs=100)
-
-
-@pytest.mark.parametrize(
-    ("scenario", "words", "absent"),
-    [
-        ("stalled", 'device "array": no sound for 0.3 s', 'device "array": no sound for 0.3 s'),
-        ("ended", 'device "array": No such device', "audio.device: "),
-        ("removed", 'device "array": No such device', "audio.device: "),
-    ],
-)
-def test_a_card_that_goes_is_missed_in_time_and_found_again(card, scenario, words, absent):
-    found = card.play(scenario)
-    assert found["error"] == words
-    assert found["absent"].startswith(absent)
-    # 0.3 s to the stall and up to 8 frames that still waited; the rest is the machine's
-    assert found["seconds"] < 2.0
-    for frame in found["frames"]:
-        assert_whole(frame)
-    assert found["closing_s"] < 0.5
-
-
-def test_a_cancelled_reader_closes_the_card(card):
-    found = card.play("cancelled")
-    assert found["opened"] == found["closed"] > 0
-    assert found["seconds"] < 0.7
-
-
-def test_a_driver_that_hangs_is_given_up_and_not_touched_again(card):
-    found = card.play("hung")
-    first, second = found["errors"]
-    assert first[:2] == ["SourceHungError", 'device "array": the driver hangs: restart the service']
-    assert second[:2] == ["SourceHungError", 'device "array": the driver still hangs: restart the service']
-    assert first[2] < 1.0
-    assert second[2] < 0.1
-    assert found["tries"] == 1  # PortAudio was left to the thread that hangs
-    assert found["after"] == 1  # and used again when it had come back
-
-
-@pytest.mark.parametrize(
-    ("audio", "words"),
-    [
-        (
-            {"device_channels": 6},
-            'audio.device_channels: 6 in settings, device "array4" offers 4',
-        ),
-        (
-            {"device_rate_hz": 44_100},
-            'audio.device_rate_hz: 44100 in settings, device "array4" refuses it (its own is 10000)',
-        ),
-        (
-            {"device_rate_hz": 8000},
-            "audio.device_rate_hz: 8000 Hz carries sound up to 4000 Hz, but correlation.band_hz goes to "
-            "4700 Hz: use a faster rate or lower the band",
-        ),
-        ({"device": "hw:7"}, 'audio.device: "hw:7" is not there; there are "array4"'),
-    ],
-)
-def test_a_card_that_does_not_fit_is_told(card, audio, words):
-    assert card.play("refused", **audio)["error"] == words
-
-
-def test_devices_are_listed(card):
-    assert card.play("list_devices")["devices"] == [["array4", 4, 10_000.0, "ALSA"]]
+@pytest.mark.parametrize("gain_db", [0.0, 12.0])
+def test_a_converter_at_its_end_is_seen_before_filters_round_it_off(tmp_path, gain_db):
+    """At 48 kHz, and where array.gains_db takes the sound down again."""
+    path = tmp_path / "a.wav"
+    sound = sines(48_000, 3)
+    sound[:, 1] = np.clip(5 * sound[:, 1], -1, 1)
+    soundfile.write(path, sound, 48_000)
+    settings = from_table({"array": {"gains_db": [0.0, gain_db, 0.0]}})
+    assert next(iter(wav_frames(path, settings))).clipped == 0b010

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import time
 from itertools import islice
 from pathlib import Path
 
 import pytest
 import soundfile
 from conftest import ROOT
+from pymavlink.dialects.v20 import common
 from test_recorder import assert_same, settings_file, sounds, start
 
+from locagen_edge.geometry import quaternion
+from locagen_edge.mavlink import dialect
+from locagen_edge.mavlink.framer import Framer
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings, load
 from locagen_edge.sim.scene import frames as sim_frames
@@ -31,7 +39,9 @@ def test_record_then_replay_of_the_folder(tmp_path, settings_file):
     process = start(folder, "--settings", str(settings_file), "--seconds", "1.5")
     out, err = process.communicate(timeout=30)
     assert process.returncode == 0, err
-    assert f"1.5 s in {folder}, 0 overruns, 0 blocks lost" in out.replace("1.6 s", "1.5 s")
+    assert f"1.5 s in {folder}, 0 overruns, 0.0 s of sound lost, 0 blocks not written" in out.replace(
+        "1.6 s", "1.5 s"
+    )
     assert err == ""  # no progress line where nobody watches
     replay = subprocess.run(
         [sys.executable, "-m", "locagen_edge", "replay", str(folder)],
@@ -162,3 +172,43 @@ def test_a_source_that_is_not_there_is_one_line(tmp_path, settings_file):
     assert process.returncode == 1
     assert err == "locagen-edge: gone.wav: there is no such file\n"
     assert list((tmp_path / "parts").iterdir()) == []
+
+
+def test_record_keeps_the_vehicles_poses_where_asked_to(tmp_path):
+    """An autopilot that says what it is asked for: nose to the west, 20 m up; a replay's frames know it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.settimeout(0.02)
+        path = tmp_path / "s.toml"
+        path.write_text(
+            f'[mavlink]\nlink = "udpout:127.0.0.1:{autopilot.getsockname()[1]}"\n[record]\nfree_mb = 0\n'
+        )
+        process = start(tmp_path / "parts", "--poses", "--seconds", "3", "--settings", str(path))
+        mav, framer, wanted, said = common.MAVLink(None, 7, 1), Framer(), set(), set()
+        begin_s, told_s = time.monotonic(), -1.0
+        while process.poll() is None:
+            with contextlib.suppress(TimeoutError):
+                data, client = autopilot.recvfrom(2048)
+                for message in (dialect.decode(packet.raw) for packet in framer.feed(data)):
+                    said.add(message.get_type())
+                    if message.get_type() == "COMMAND_LONG" and message.command == 511:
+                        wanted.add(round(message.param1))
+            ms = round((time.monotonic() - begin_s) * 1000) + 60_000
+            messages = [common.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3)] if ms / 1000 - told_s > 1 else []
+            told_s = ms / 1000 if messages else told_s
+            if 31 in wanted:
+                q = quaternion(0.0, 0.0, -math.pi / 2)
+                messages.append(common.MAVLink_attitude_quaternion_message(ms, *q, 0, 0, 0))
+            if 33 in wanted:
+                place = (47 * 10**7, 8 * 10**7, 0, 20_000)
+                messages.append(common.MAVLink_global_position_int_message(ms, *place, *[0] * 4))
+            for message in messages if said else []:
+                autopilot.sendto(bytes(message.pack(mav)), client)
+        _, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    assert said <= {"HEARTBEAT", "COMMAND_LONG", "TIMESYNC"}
+    frames = list(wav_frames(sounds(tmp_path / "parts"), load(path)))
+    poses = [frame.pose for frame in frames if frame.pose is not None]
+    assert len(poses) > len(frames) / 3
+    assert poses[-1].height_m == pytest.approx(20.0, abs=0.1)
+    assert poses[-1].attitude == pytest.approx(quaternion(0.0, 0.0, -math.pi / 2), abs=1e-3)

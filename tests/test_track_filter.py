@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locagen_edge.geometry import angles, direction, quaternion, rotation
+from locagen_edge.geometry import angles, direction, quaternion, rotation, tangent
 from locagen_edge.settings import TrackSettings
 from locagen_edge.stages.track import filter as sphere
 from locagen_edge.stages.track.association import associate
@@ -33,14 +33,14 @@ def measurement(b: Bearing, turn=LEVEL) -> sphere.Measurement:
 def noisy(u: np.ndarray, turn: np.ndarray, sigma: float, rng: np.random.Generator) -> sphere.Measurement:
     """What an estimator with this sigma would say of a source at u (in the filter's axes)."""
     here = turn.T @ u
-    seen = here + sigma * rng.standard_normal(2) @ sphere.tangent(here)
+    seen = here + sigma * rng.standard_normal(2) @ tangent(here)
     azimuth, elevation = angles(seen / np.linalg.norm(seen))
     return measurement(bearing(azimuth, elevation, sigma, sigma), turn)
 
 
 def error2(state: sphere.State, u: np.ndarray) -> float:
     """Normalised estimation error squared of the direction: chi-square of 2 where the covariance is true."""
-    across = sphere.tangent(state.u)
+    across = tangent(state.u)
     off = across @ (u - state.u)
     return float(off @ np.linalg.solve(across @ state.p[:3, :3] @ across.T, off))
 

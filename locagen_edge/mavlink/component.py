@@ -529,6 +529,8 @@ class Component:
         yield "CAMERA_TRACKING_GEO_STATUS", camera_target(surest, from_deg)
 
     def _computer(self, now_s: float, _: Status) -> Made:
+        if dialect.ONBOARD_COMPUTER_STATUS not in self._allowed:
+            return  # its reading costs milliseconds
         computer = self._hands.computer(round(now_s * 1e9))
         if computer is not None:
             yield "ONBOARD_COMPUTER_STATUS", computer

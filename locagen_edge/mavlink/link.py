@@ -23,9 +23,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-import serial  # type: ignore[import-untyped]
-import serial_asyncio_fast
-
 from locagen_edge.errors import LinkError
 
 OPEN_S = 2.0
@@ -200,7 +197,7 @@ def _in_words(error: Exception | None) -> str:
     if (
         isinstance(error, OSError)
         and error.errno
-        and not isinstance(error, socket.gaierror | serial.SerialException)
+        and type(error).__module__ == "builtins"  # the resolver's and pyserial's say it better themselves
     ):
         return os.strerror(error.errno)  # asyncio's own text names the address again instead of the reason
     return str(getattr(error, "strerror", None) or error)
@@ -361,13 +358,6 @@ class _UdpIn(_UdpOut):
         return self._peers
 
 
-class _SerialTransport(serial_asyncio_fast.SerialTransport):
-    """pyserial-asyncio-fast, except that a device pulled out while we write is no traceback in the log."""
-
-    def _fatal_error(self, exc: BaseException, message: str = "") -> None:  # noqa: ARG002
-        self._abort(exc)
-
-
 # --- openers ------------------------------------------------------------------------------------------
 
 
@@ -410,14 +400,13 @@ def _bound_waiting(transport: asyncio.BaseTransport) -> None:
 
 
 async def _open_serial(link: Link) -> _Port:
+    from locagen_edge.mavlink import uart  # pyserial is for those who have a serial port
+
     # Opening a USB adapter takes tens of milliseconds: not on the loop that carries sound.
-    # exclusive: two programs on one UART each get half of the bytes, and neither is told.
-    device = await asyncio.to_thread(
-        serial.Serial, link.spec.target, baudrate=link.spec.number, exclusive=True
-    )
+    device = await asyncio.to_thread(uart.opened, link.spec.target, link.spec.number)
     port = _Stream(link)
     # The transport calls connection_made too, but only in the loop's next round.
-    port.connection_made(_SerialTransport(asyncio.get_running_loop(), port, device))
+    port.connection_made(uart.Transport(asyncio.get_running_loop(), port, device))
     return port
 
 

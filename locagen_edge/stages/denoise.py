@@ -291,6 +291,8 @@ class MaskStream:
         self.noise = NoiseSpectrum(mics, forget_s * RATE_HZ / STEP)
         self._earliest = EARLIEST_S * RATE_HZ / STEP
         self._listening = Listening(forget_s * RATE_HZ / STEP)
+        self.power: F64 = np.zeros((mics, 0, BINS + 1))
+        """(mics, spectra, bins) of the last chunks"""
         self.reset()
 
     def reset(self) -> None:
@@ -309,9 +311,10 @@ class MaskStream:
         """
         long = np.concatenate([self._held, sound], axis=1)
         self._held = long[:, -(WINDOW - STEP) :]
-        pieces = np.lib.stride_tricks.sliding_window_view(long, WINDOW, axis=1)[:, ::STEP]
+        ends = range(WINDOW, long.shape[1] + 1, STEP)
+        pieces = np.stack([long[:, end - WINDOW : end] for end in ends], axis=1)
         spectra = np.fft.rfft(pieces * self._taper, axis=2)
-        power = np.square(spectra.real) + np.square(spectra.imag)
+        self.power = power = np.square(spectra.real) + np.square(spectra.imag)
         at = range(0, power.shape[1], CHUNK // STEP)
         return spectra, np.concatenate([self._mask(power[:, k : k + CHUNK // STEP]) for k in at])
 
@@ -332,9 +335,9 @@ class MaskStream:
         mask[:, 0] = 0.0
         return mask
 
-    def learn(self, power: F64) -> None:
-        """Takes the last chunk, whose spectra have this power (mics, 4 k, BINS + 1), as noise."""
-        self.noise.learn(power)
+    def learn(self) -> None:
+        """Takes the last chunks as noise."""
+        self.noise.learn(self.power)
         # a network that has heard noise for a while: its mask of the first moments says nothing
         if self.noise.spectra.max() >= 2.0 * self._earliest:
             self._listening.learn()
@@ -368,7 +371,6 @@ class MaskDenoiser:
         per_frame = (audio.frame - WINDOW) // STEP + 1
         self._masks: F32 = np.ones((per_frame, BINS + 1), dtype=np.float32)
         self._power: F64 = np.zeros((per_frame, BINS + 1))
-        self._ended: F64 = np.zeros((mics, 0, BINS + 1))
         at = np.arange(audio.frame // 2 + 1) * (WINDOW / audio.frame)
         self._low = np.minimum(at.astype(np.intp), BINS - 1)
         self._share = (at - self._low).astype(np.float32)
@@ -382,9 +384,8 @@ class MaskDenoiser:
             self._stream.reset()
             self._masks[:] = 1.0
             self._power[:] = 0.0
-        spectra, mask = self._stream(sound)
-        power = np.square(spectra.real) + np.square(spectra.imag)
-        self._ended = power
+        _, mask = self._stream(sound)
+        power = self._stream.power
         self._masks = np.concatenate([self._masks, mask])[-len(self._masks) :]
         self._power = np.concatenate([self._power, power.mean(axis=0)])[-len(self._power) :]
         # mask k belongs to the spectrum LOOKAHEAD before: the frame's first ones have theirs
@@ -404,7 +405,7 @@ class MaskDenoiser:
     def settle(self, call: bool, /) -> None:
         """Learns the frame's new spectra as noise where it held no call."""
         if not call:
-            self._stream.learn(self._ended)
+            self._stream.learn()
 
 
 # --- Wiener -------------------------------------------------------------------------------------------

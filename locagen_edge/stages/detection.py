@@ -17,8 +17,6 @@ from __future__ import annotations
 import math
 from collections import deque
 
-import numpy as np
-
 from locagen_edge.settings import DetectionSettings
 from locagen_edge.types import Bearing, Correlation, Detection
 
@@ -49,12 +47,11 @@ class Detector:
 
     def __call__(self, correlation: Correlation, bearing: Bearing, elapsed_s: float) -> Detection:
         """`elapsed_s`: since the previous frame."""
-        power = correlation.power.astype(np.float64)
-        live = power[power > SILENCE]
-        if not len(live):
+        live = [power for power in correlation.power.tolist() if power > SILENCE]
+        if not live:
             self._since_s = 0.0
             return Detection(call=False, snr_db=SNR_RANGE_DB[0], level_dbfs=10.0 * math.log10(SILENCE))
-        level = float(live.mean())
+        level = sum(live) / len(live)
         background = self._follow(level, elapsed_s)
         least, most = SNR_RANGE_DB
         excess = level / background - 1.0

@@ -30,10 +30,12 @@ import soundfile
 
 from locagen_edge.alignment import Aligner
 from locagen_edge.errors import SourceError, SourceHungError
-from locagen_edge.framing import Framer, Tap, in_real_time
+from locagen_edge.framing import CLIPPED_SHARE, FULL_SCALE, Framer, Tap, in_real_time
+from locagen_edge.gone import close_gone
 from locagen_edge.jsonl import Record, read
 from locagen_edge.poses import Poses, pose_of
 from locagen_edge.resampling import Resampler
+from locagen_edge.sampleclock import SampleClock
 from locagen_edge.settings import Settings
 from locagen_edge.types import Array, Frame, Pose
 
@@ -41,9 +43,8 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.02  # 50 wake-ups a second; less than half the default hop
 LATENCY_S = 0.4  # the card's buffer: what may pile up while this process does not get to run; delays nothing
-LOSS_S = 0.05  # more than the coarsest pointer of a USB card moves at once (a few ms to 20 ms)
-LOSS_POLLS = 10  # a late pointer recovers within a poll or two; sound that is lost stays lost
-DRIFT_POLLS = 500  # 10 s: jitter averages out, and 100 ppm of clock error lag by 1 ms
+CARDS = Path("/proc/asound")  # where the kernel tells its cards' ids
+TURN_S = 0.5  # what one turn of waiting counts at most: a process that was suspended has not waited
 OPEN_S = 10.0  # PortAudio asks every card at its start: about a second on a small board
 CLOSE_S = 0.5  # of the second in which the service must end
 
@@ -62,6 +63,8 @@ class _Cutter:
         array = settings.array
         self._aligner = Aligner(array.delays_s, array.gains_db, audio.rate_hz, len(self._map))
         self.framer = Framer(audio.frame, audio.hop, len(self._map), audio.rate_hz)
+        self._rows = 0  # since the last frame, and how many of them stood at full scale
+        self._full: Array = np.zeros(len(self._map), dtype=np.int64)
 
     def push(self, rows: Array) -> list[Frame]:
         """Frames from (n, channels), int16 or float32."""
@@ -70,7 +73,15 @@ class _Cutter:
         chosen = rows[:, self._map].astype(np.float32)
         if rows.dtype == np.int16:
             chosen /= 32768.0  # full scale 1.0
-        return self.framer.push(self._aligner.push(self._resampler.push(chosen)).T)
+        # here and not in the frame: filters round what the converter has cut off, gains move it
+        self._full += np.count_nonzero(np.abs(chosen) >= FULL_SCALE, axis=0)
+        self._rows += len(rows)
+        frames = self.framer.push(self._aligner.push(self._resampler.push(chosen)).T)
+        if not frames:
+            return frames
+        clipped = sum(1 << m for m, full in enumerate(self._full) if full > CLIPPED_SHARE * self._rows)
+        self._full[:], self._rows = 0, 0
+        return [replace(frame, clipped=clipped) for frame in frames] if clipped else frames
 
     def finish(self) -> list[Frame]:
         """The last frames: resampler and aligner give up all they hold."""
@@ -107,6 +118,16 @@ class Device:
     default_rate_hz: float
     host_api: str
 
+    @property
+    def stable_name(self) -> str:
+        """`hw:CARD=ID,DEV=N` for a card of the kernel's, whatever its number is today; else its name."""
+        match = re.search(r"\(hw:(\d+),(\d+)\)", self.name)
+        with suppress(OSError):
+            if match:
+                name = (CARDS / f"card{match[1]}" / "id").read_text(encoding="utf-8").strip()
+                return f"hw:CARD={name},DEV={match[2]}"
+        return self.name
+
 
 def devices() -> list[Device]:
     """The devices that can record now. Not while a source is open: PortAudio is started afresh.
@@ -138,8 +159,7 @@ async def alsa(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Fra
     try:
         while True:
             try:
-                async with asyncio.timeout(patience_s):
-                    frame = await box.get()
+                frame = await _patiently(box, patience_s)
             except TimeoutError:
                 raise SourceHungError(f"{_label(settings)}: the driver hangs: restart the service") from None
             # The thread reports a stall itself, after stall_s; later than that it is stuck.
@@ -153,6 +173,16 @@ async def alsa(settings: Settings, tap: Tap | None = None) -> AsyncGenerator[Fra
         except TimeoutError:
             _hung = thread
             log.error("%s: the driver does not let go", _label(settings))
+
+
+async def _patiently(box: _Mailbox, patience_s: float) -> Frame:
+    """The next frame. Raises `TimeoutError` after so long; time in which this process stood still is none."""
+    turns = max(round(patience_s / TURN_S), 1)
+    for _ in range(turns):
+        with suppress(TimeoutError):
+            async with asyncio.timeout(patience_s / turns):
+                return await box.get()
+    raise TimeoutError
 
 
 def _label(settings: Settings) -> str:
@@ -243,54 +273,31 @@ def capture(
     cutter = _Cutter(settings, rate_hz, tap)
     clock = SampleClock(rate_hz)
     samples = 0
-    heard_ns = now_ns()
+    quiet_ns = 0
+    asked_ns = now_ns()
     while not wait(POLL_S):
-        asked_ns = now_ns()
+        before_ns, asked_ns = asked_ns, now_ns()
         waiting = stream.read_available
         if not waiting:
-            if asked_ns - heard_ns > settings.daemon.stall_s * 1e9:
+            quiet_ns += min(asked_ns - before_ns, round(TURN_S * 1e9))
+            if quiet_ns > settings.daemon.stall_s * 1e9:
                 raise SourceError(f"{_label(settings)}: no sound for {settings.daemon.stall_s:g} s")
             continue
-        heard_ns = asked_ns
+        quiet_ns = 0
         rows, overflowed = stream.read(waiting)
+        if rows.dtype == np.int32:  # exact for 24 bits, and below a 32-bit converter's noise
+            rows = rows.astype(np.float32) * np.float32(2.0**-31)
         if overflowed or not clock.update(samples + waiting, asked_ns):
             cutter.gap()
-            clock = SampleClock(rate_hz)
+            clock = SampleClock(rate_hz, clock.drift)
             samples = 0
             if overflowed:
                 continue  # the card may have overrun within this very read: both sides of the gap are in it
             clock.update(waiting, asked_ns)
         samples += waiting
         cutter.framer.origin_ns = clock.origin_ns
-        yield from cutter.push(rows)
-
-
-class SampleClock:
-    """Monotonic time of a card's samples, from how many there were when.
-
-    The card's crystal is off by up to 100 ppm and the pointer into its buffer moves in steps, so time follows
-    the count, slowly corrected.
-    """
-
-    def __init__(self, rate_hz: float) -> None:
-        self.origin_ns = 0
-        """monotonic time of the first sample, as the card's clock stands now"""
-        self._rate_hz = rate_hz
-        self._polls = 0
-        self._late_ns: collections.deque[int] = collections.deque(maxlen=LOSS_POLLS)
-
-    def update(self, samples: int, now_ns: int) -> bool:
-        """`samples` had come by `now_ns`. False: count and clock have parted: sound was lost in silence."""
-        origin_ns = now_ns - round(samples * 1e9 / self._rate_hz)
-        if self._polls == 0:
-            self.origin_ns = origin_ns
-        late_ns = origin_ns - self.origin_ns
-        self._late_ns.append(late_ns)
-        self._polls += 1
-        self.origin_ns += round(late_ns / min(self._polls, DRIFT_POLLS))
-        lasting = len(self._late_ns) == LOSS_POLLS
-        limit_ns = LOSS_S * 1e9
-        return not (lasting and (min(self._late_ns) > limit_ns or max(self._late_ns) < -limit_ns))
+        for frame in cutter.push(rows):
+            yield frame if clock.drift is None else replace(frame, drift=clock.drift)
 
 
 def _portaudio() -> ModuleType:
@@ -320,7 +327,7 @@ def _devices(sd: ModuleType) -> list[Device]:
 
 
 def _choose(found: list[Device], settings: Settings) -> Device:
-    """The device that `audio.device` means: by its whole name, or else by a part that only one has."""
+    """The device that `audio.device` means: by its card's id, its whole name, or a part that only one has."""
     wanted = settings.audio.device
     names = ", ".join(f'"{d.name}"' for d in found)
     if not found:
@@ -328,7 +335,9 @@ def _choose(found: list[Device], settings: Settings) -> Device:
     if not wanted:
         # ALSA's own name for the default, or the first card where that is not set up
         return next((d for d in found if d.name == "default"), found[0])
-    fitting = [d for d in found if d.name == wanted] or [d for d in found if wanted.lower() in d.name.lower()]
+    by_card = f"{wanted},DEV=0" if re.fullmatch(r"hw:CARD=[^,]+", wanted) else wanted
+    fitting = [d for d in found if by_card == d.stable_name or d.name == wanted]
+    fitting = fitting or [d for d in found if wanted.lower() in d.name.lower()]
     if not fitting:
         raise SourceError(f'audio.device: "{wanted}" is not there; there are {names}')
     if len(fitting) > 1:
@@ -357,7 +366,7 @@ def _opened(sd: ModuleType, settings: Settings) -> Iterator[InputStream]:
             device=device.index,
             samplerate=audio.device_rate_hz,
             channels=audio.device_channels,
-            dtype=audio.sample_format,
+            dtype=DTYPES[audio.sample_format],
             latency=LATENCY_S,
         ) as stream:
             yield stream
@@ -369,8 +378,12 @@ def _opened(sd: ModuleType, settings: Settings) -> Iterator[InputStream]:
             )
             raise SourceError(message) from error
         raise SourceError(f"{_label(settings)}: {_reason(error)}") from error
+    finally:
+        close_gone()
 
 
+# PortAudio's packed 24 bits have no dtype: it shifts them up into 32, where numpy reads them
+DTYPES = {"int16": "int16", "int24": "int32", "float32": "float32"}
 INVALID_SAMPLE_RATE = -9997  # PaErrorCode, portaudio.h
 
 

@@ -51,37 +51,39 @@ class PeakPicker:
         lags = 1.0 + 2.0 * float(self._limit_s.max()) * (high - low)
         self._least_peak = math.sqrt(RHO / len(bins) * math.log(lags / CHANCE))
         self._step_s = 1.0 / (settings.oversample * rate_hz)
-        self._outside: np.ndarray | None = None
         self._margin_s = LAG_MARGIN_SAMPLES / rate_hz
-        self._rows = np.arange(len(array.pairs))
-        self._first, self._second = np.array(array.pairs).T
+        self._pairs = array.pairs
+        self._lags: list[tuple[int, int]] | None = None
 
-    def _mask(self, lag_s: F64) -> np.ndarray:
-        """(pairs, lags) True where a pair's own spacing forbids the lag, or no neighbour is left."""
-        if self._outside is None:
-            outside = np.abs(lag_s)[None, :] > self._limit_s[:, None] + self._margin_s
-            outside[:, [0, -1]] = True
-            self._outside = outside
-        return self._outside
+    def _allowed(self, lag_s: F64) -> list[tuple[int, int]]:
+        """The first lag of each pair that its own spacing allows and that has neighbours, and the one after
+        the last."""
+        if self._lags is None:
+            allowed = np.abs(lag_s)[None, :] <= self._limit_s[:, None] + self._margin_s
+            allowed[:, [0, -1]] = False
+            self._lags = [(int(row[0]), int(row[-1]) + 1) for row in map(np.flatnonzero, allowed)]
+        return self._lags
 
     def __call__(self, correlation: Correlation) -> Tdoa:
-        values = correlation.values
-        best = np.where(self._mask(correlation.lag_s), -np.inf, values).argmax(axis=1)
-        left = values[self._rows, best - 1].astype(np.float64)
-        top = values[self._rows, best].astype(np.float64)
-        right = values[self._rows, best + 1].astype(np.float64)
-        bend = 2.0 * top - left - right
-        fill = np.sqrt(correlation.fill[self._first].astype(np.float64) * correlation.fill[self._second])
-        good = (top > self._least_peak * np.sqrt(fill)) & (bend > 0.0)
-        bend = np.where(good, bend, 1.0)
-        shift = np.clip((right - left) / (2.0 * bend), -1.0, 1.0)
-        peak = np.clip(top + (right - left) * shift / 4.0, 0.0, 1.0)
-        curvature = bend / self._step_s**2
-        coherence = np.minimum(peak / np.maximum(fill, 1e-9), 1.0)
-        noise = np.sqrt(fill * np.maximum(1.0 - coherence**4, LEAST_NOISE))
-        sigma = self._slope_noise * noise / curvature
-        return Tdoa(
-            delay_s=np.where(good, correlation.lag_s[best] + shift * self._step_s, np.nan),
-            sigma_s=np.where(good, sigma, np.inf),
-            peak=np.where(good, peak, 0.0),
-        )
+        values, fills = correlation.values, correlation.fill.tolist()
+        delay_s, sigma_s, peaks = [], [], []
+        for row, ((i, j), (low, high)) in enumerate(
+            zip(self._pairs, self._allowed(correlation.lag_s), strict=True)
+        ):
+            best = low + int(values[row, low:high].argmax())
+            left, top, right = values[row, best - 1 : best + 2].tolist()
+            bend = 2.0 * top - left - right
+            fill = math.sqrt(fills[i] * fills[j])
+            if not (top > self._least_peak * math.sqrt(fill) and bend > 0.0):
+                delay_s.append(math.nan)
+                sigma_s.append(math.inf)
+                peaks.append(0.0)
+                continue
+            shift = min(max((right - left) / (2.0 * bend), -1.0), 1.0)
+            peak = min(max(top + (right - left) * shift / 4.0, 0.0), 1.0)
+            coherence = min(peak / max(fill, 1e-9), 1.0)
+            noise = math.sqrt(fill * max(1.0 - coherence**4, LEAST_NOISE))
+            delay_s.append(float(correlation.lag_s[best]) + shift * self._step_s)
+            sigma_s.append(self._slope_noise * noise / (bend / self._step_s**2))
+            peaks.append(peak)
+        return Tdoa(np.array(delay_s), np.array(sigma_s), np.array(peaks))

@@ -23,8 +23,10 @@ def prepare(directory: Path) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         probe = directory / f".{os.getpid()}{PART}"
-        probe.touch()
-        probe.unlink()
+        try:
+            probe.touch()
+        finally:
+            probe.unlink(missing_ok=True)
     except FileExistsError as error:
         raise StorageError(f"{directory}: is a file, not a folder") from error
     except OSError as error:

@@ -52,35 +52,54 @@ def build(directory: Path) -> Path:
     return library
 
 
+def packed(rows: np.ndarray, sample: str) -> bytes:
+    """Rows at full scale 1.0 as a card gives them that has this ALSA format."""
+    if sample == "FLOAT_LE":
+        return rows.astype("<f4").tobytes()
+    bits = {"S16_LE": 16, "S24_3LE": 24, "S32_LE": 32}[sample]
+    whole = np.rint(rows * 2.0 ** (bits - 1)).clip(-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1)
+    if sample == "S24_3LE":
+        return whole.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3].tobytes()
+    return whole.astype(f"<i{bits // 8}").tobytes()
+
+
 class VirtualCard:
-    """A card named `name`, on a configuration of its own."""
+    """A card that plays `rows` (n, channels), full scale 1.0, round and round, on a configuration of its own.
+
+    `more`: lines for that configuration, as other devices on top of this one.
+    """
 
     def __init__(
-        self, library: Path, directory: Path, name: str = "array4", rate_hz: int = 10_000, real: bool = False
+        self,
+        library: Path,
+        directory: Path,
+        name: str = "array4",
+        rate_hz: int = 10_000,
+        sample: str = "S16_LE",
+        rows: np.ndarray | None = None,
+        more: str = "",
     ) -> None:
         self.directory = directory
-        rows = ramp(4)
-        if real:
-            (directory / "rows").write_bytes((rows / np.float32(32768)).astype("<f4").tobytes())
-        else:
-            (directory / "rows").write_bytes(rows.tobytes())
+        self.rate_hz = rate_hz
+        rows = ramp(4) / 32768 if rows is None else rows
+        (directory / "rows").write_bytes(packed(rows, sample))
         (directory / "control").write_bytes(bytes(4096))
         (directory / "asound.conf").write_text(
             "</usr/share/alsa/alsa.conf>\n"
             f'pcm_type.virtual {{ lib "{library}" }}\n'
             f'pcm.{name} {{ type virtual file "{directory}/rows" control "{directory}/control" '
-            f"channels 4 rate {rate_hz} float {int(real)} }}\n",
+            f"channels {rows.shape[1]} rate {rate_hz} format {sample} }}\n{more}\n",
             encoding="utf-8",
         )
 
-    def play(self, scenario: str, **audio: object) -> dict:
+    def play(self, scenario: str, stall_s: float = 0.3, **audio: object) -> dict:
         """What the scenario found, run with these settings of [audio]."""
         table = {
             "audio": {
-                "source": "alsa", "device": "array", "device_rate_hz": 10_000, "device_channels": 4,
+                "source": "alsa", "device": "array", "device_rate_hz": self.rate_hz, "device_channels": 4,
                 "channel_map": [2, 0, 3], **audio,
             },
-            "daemon": {"stall_s": 0.3},
+            "daemon": {"stall_s": stall_s},
         }  # fmt: skip
         child = subprocess.run(
             [sys.executable, "-W", "error", HERE / "scenarios.py", scenario],
@@ -90,3 +109,18 @@ class VirtualCard:
         )  # fmt: skip
         assert child.returncode == 0, child.stderr
         return json.loads(child.stdout)
+
+
+MAP = (2, 0, 3)
+
+
+def rows_of(frame: dict, channels: tuple[int, ...] = MAP) -> np.ndarray:
+    """(n,) row numbers, which must agree between the microphones."""
+    rows = np.stack([row_of(s, channel) for s, channel in zip(frame["samples"], channels, strict=True)])
+    assert (rows == rows[0]).all()
+    return rows[0]
+
+
+def assert_whole(frame: dict) -> None:
+    """Every row once and in order."""
+    assert (np.diff(rows_of(frame)) % ROWS == 1).all()

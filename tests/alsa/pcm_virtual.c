@@ -5,7 +5,7 @@
  * round; what nobody reads in time is lost, as on a real card. See alsa-lib, "PCM External Plugin SDK".
  *
  * A page shared with the test (struct control below) steers it while it runs. Keys in asound.conf:
- *   file, control: paths     channels, rate: of the file     float: 1 for FLOAT_LE, else S16_LE
+ *   file, control: paths     channels, rate: of the file     format: S16_LE, S24_3LE, S32_LE or FLOAT_LE
  */
 #include <alsa/asoundlib.h>
 #include <alsa/pcm_external.h>
@@ -227,7 +227,8 @@ static int card_limits(struct card *card, unsigned int channels, snd_pcm_format_
 SND_PCM_PLUGIN_DEFINE_FUNC(virtual)
 {
 	const char *file = NULL, *control = NULL;
-	long channels = 4, rate = 48000, is_float = 0;
+	const char *format_name = "S16_LE";
+	long channels = 4, rate = 48000;
 	size_t control_bytes = 0;
 	snd_config_iterator_t i, next;
 	(void)root;
@@ -246,9 +247,13 @@ SND_PCM_PLUGIN_DEFINE_FUNC(virtual)
 			snd_config_get_integer(entry, &channels);
 		else if (!strcmp(key, "rate"))
 			snd_config_get_integer(entry, &rate);
-		else if (!strcmp(key, "float"))
-			snd_config_get_integer(entry, &is_float);
+		else if (!strcmp(key, "format"))
+			snd_config_get_string(entry, &format_name);
 	}
+
+	snd_pcm_format_t format = snd_pcm_format_value(format_name);
+	if (snd_pcm_format_physical_width(format) <= 0)
+		return -EINVAL;
 
 	struct card *card = calloc(1, sizeof *card);
 	if (!card)
@@ -257,7 +262,7 @@ SND_PCM_PLUGIN_DEFINE_FUNC(virtual)
 	card->control = map_file(control, O_RDWR, PROT_READ | PROT_WRITE, &control_bytes);
 	card->rows = map_file(file, O_RDONLY, PROT_READ, &card->bytes);
 	card->rate = (double)rate;
-	card->row_bytes = (size_t)channels * (is_float ? 4 : 2);
+	card->row_bytes = (size_t)channels * (size_t)snd_pcm_format_physical_width(format) / 8;
 	card->row_count = card->bytes / card->row_bytes;
 	int error = -ENOENT;
 	if (card->timer < 0 || control_bytes < sizeof *card->control || !card->row_count)
@@ -275,7 +280,7 @@ SND_PCM_PLUGIN_DEFINE_FUNC(virtual)
 	error = snd_pcm_ioplug_create(&card->io, name, stream, mode);
 	if (error < 0)
 		goto fail;
-	error = card_limits(card, (unsigned int)channels, is_float ? SND_PCM_FORMAT_FLOAT_LE : SND_PCM_FORMAT_S16_LE);
+	error = card_limits(card, (unsigned int)channels, format);
 	if (error < 0) {
 		snd_pcm_ioplug_delete(&card->io); /* closes and frees */
 		return error;

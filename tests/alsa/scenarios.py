@@ -6,14 +6,19 @@ import asyncio
 import json
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
+from server import SoundServer
 
+from locagen_edge.daemon import Daemon
 from locagen_edge.errors import SourceError
 from locagen_edge.settings import Settings, from_table
 from locagen_edge.sources import open_source
 from locagen_edge.stages import mic
 
+DIRECTORY = Path()
+"""of the test's own, as the order says"""
 RUN, STALL, ENDED, REMOVED = range(4)
 MODE, XRUNS, PPM, SKIP, OPENED, CLOSED = range(6)  # struct control of pcm_virtual.c
 
@@ -39,7 +44,7 @@ async def closing_s(source):
 async def listen(settings, control):
     before_ns = time.monotonic_ns()
     source = open_source(settings)
-    frames = await take(source, 12)
+    frames = await take(source, 6)
     after_ns = time.monotonic_ns()
     seconds = await closing_s(source)
     return {
@@ -159,18 +164,89 @@ async def hung(settings, control):
     return {"errors": errors, "tries": len(asleep), "after": len(frames)}
 
 
+async def from_server(settings, control):
+    """Some frames of a sound server, from when its players have begun."""
+    server = SoundServer(DIRECTORY)
+    server.start()
+    try:
+        source = open_source(settings)
+        while np.any(np.abs((frame := await anext(source)).samples).max(axis=1) == 0):
+            pass
+        frames = [frame, *await take(source, 10)]
+        return {"frames": told(frames), "closing_s": await closing_s(source)}
+    finally:
+        server.kill()
+
+
+async def server_killed(settings, control):
+    server = SoundServer(DIRECTORY)
+    server.start()
+    try:
+        return await come_back(settings, lose=server.kill, bring_back=server.start)
+    finally:
+        server.kill()
+
+
+async def replugged(settings, control):
+    def mode(value):
+        control[MODE] = value
+
+    return await come_back(settings, lose=lambda: mode(REMOVED), bring_back=lambda: mode(RUN))
+
+
+async def come_back(settings, lose, bring_back):
+    """A daemon whose card is gone for so long that its pauses are at their longest."""
+    daemon = Daemon(settings)
+    await daemon.startup()
+    main = asyncio.create_task(daemon.main_loop())
+    counters = daemon.counters
+    try:
+        await until(lambda: counters.estimates > 5)
+        lose()
+        await until(lambda: daemon.source_fault)
+        fault = daemon.source_fault
+        status = []
+        await until(lambda: counters.source_failures >= 4 and not daemon.hearing)
+        status.append(daemon._in_words())
+        bring_back()
+        failures, back = counters.source_failures, time.monotonic()
+        estimates = counters.estimates
+        await until(lambda: counters.estimates > estimates)
+        seconds = time.monotonic() - back
+        await until(lambda: counters.estimates > estimates + 5)
+        return {
+            "fault": fault, "seconds": seconds, "tries": counters.source_failures - failures,
+            "status": [*status, daemon._in_words()], "lost_s": counters.sound.lost_s,
+        }  # fmt: skip
+    finally:
+        daemon.stop()
+        await main
+        await daemon.shutdown()
+
+
+async def until(condition):
+    async with asyncio.timeout(30):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
 async def list_devices(settings, control):
     return {"devices": [[d.name, d.channels, d.default_rate_hz, d.host_api] for d in mic.devices()]}
 
 
 SCENARIOS = {
     f.__name__: f
-    for f in (listen, overrun, skip, stalled, ended, removed, cancelled, refused, hung, list_devices)
-}
+    for f in (
+        listen, overrun, skip, stalled, ended, removed, cancelled, refused, hung, from_server, server_killed,
+        replugged, list_devices,
+    )
+}  # fmt: skip
 
 
 def main() -> None:
+    global DIRECTORY
     order = json.load(sys.stdin)
+    DIRECTORY = Path(order["control"]).parent
     settings: Settings = from_table(order["table"])
     control = np.memmap(order["control"], dtype=np.uint32, mode="r+", shape=(16,))
     json.dump(asyncio.run(SCENARIOS[sys.argv[1]](settings, control)), sys.stdout)

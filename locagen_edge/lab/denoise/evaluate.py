@@ -101,7 +101,7 @@ def mask_method(model: str, s: LabSettings) -> Method:
             spectra, mask = stream(piece[np.newaxis])
             out.append(stream.cleaned(spectra, mask)[0])
             if first + CHUNK <= before:
-                stream.learn(np.abs(spectra) ** 2)
+                stream.learn()
         return np.concatenate(out)[MASK_DELAY : MASK_DELAY + len(sound)]
 
     return run

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from locagen_edge.geometry import FLAT_M, angles, wrap
+from locagen_edge.geometry import FLAT_M, angles, tangent, wrap
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import (
     LARGEST_AZIMUTH_SIGMA_RAD,
@@ -72,13 +72,15 @@ def far_field(settings: Settings, name: str = "far-field") -> Estimator:
             if len(a) < 2 or np.linalg.matrix_rank(a @ plane.T) < 2:
                 return no_bearing(name)
         a, delay = a / sigma[:, None], delay / sigma
-        v = np.linalg.lstsq(a @ plane.T, delay, rcond=None)[0]
+        in_plane = a @ plane.T
+        v = _inverse(in_plane) @ delay
         inside = float(v @ v)
         if inside >= 1.0:
             v = v / math.sqrt(inside)
         across = normal * math.sqrt(max(1.0 - inside, 0.0))
         starts = [plane.T @ v + across, plane.T @ v - across]
-        fits = [_judged(u, a, delay, related, plane, normal) for u in _followed(starts, a, delay, flat)]
+        least = _least_tilt(in_plane)
+        fits = [_judged(u, a, delay, related, normal, least) for u in _followed(starts, a, delay, flat)]
         return _chosen(fits, alike, max(spare + int(inside >= 1.0) - int((~heard).sum()), 1), name)
 
     return estimate
@@ -92,11 +94,11 @@ def _followed(starts: list[F64], a: F64, delay: F64, flat: bool) -> list[F64]:
     for start in starts:
         u = start
         for _ in range(MOST_STEPS):
-            tangent = _tangent(u)
+            across = tangent(u)
             # at the rim of a nearly flat array one direction is hardly seen: rcond leaves it alone
-            step = np.linalg.lstsq(a @ tangent.T, delay - a @ u, rcond=1e-3)[0]
+            step = np.linalg.lstsq(a @ across.T, delay - a @ u, rcond=1e-3)[0]
             length = float(np.linalg.norm(step))
-            u = u + step @ tangent * min(1.0, 0.5 / max(length, 1e-12))
+            u = u + step @ across * min(1.0, 0.5 / max(length, 1e-12))
             u = u / np.linalg.norm(u)
             if length < CLOSE_RAD:
                 break
@@ -104,28 +106,44 @@ def _followed(starts: list[F64], a: F64, delay: F64, flat: bool) -> list[F64]:
     return ends
 
 
-def _tangent(u: F64) -> F64:
-    """(2, 3): across the direction level with the horizon, and towards the zenith."""
-    flat = math.hypot(u[0], u[1])
-    level = np.array([-u[1], u[0], 0.0]) / flat if flat > 1e-9 else np.array([0.0, 1.0, 0.0])
-    return np.stack([level, np.cross(level, u)])
+def _inverse(a: F64) -> F64:
+    """(2, n): the pseudo-inverse of (n, 2), by Gram and Schmidt: a tenth of a singular value decomposition's
+    time, and as exact where the columns are not nearly one."""
+    first, second = a[:, 0], a[:, 1]
+    length2 = float(first @ first)
+    shared = float(first @ second) / length2 if length2 else 0.0
+    rest = second - shared * first
+    rest2 = float(rest @ rest)
+    if rest2 <= 1e-18 * length2 or length2 <= 1e-18 * rest2:
+        return np.asarray(np.linalg.pinv(a, rcond=1e-9), dtype=np.float64)
+    inverse: F64 = np.empty((2, len(a)))
+    inverse[1] = rest / rest2
+    inverse[0] = first / length2 - shared * inverse[1]
+    return inverse
 
 
-def _judged(u: F64, a: F64, delay: F64, related: F64, plane: F64, normal: F64) -> _Fit:
-    """Misfit and sigmas of an answer; `a` and `delay` are in units of the delays' sigma."""
+def _least_tilt(in_plane: F64) -> float:
+    """How far a unit vector has to stand out of the array's plane for its tilt to be seen to first order.
+
+    Nearer, the tilt is seen to second order only, and the 1-sigma of what is seen in the plane bounds it.
+    `in_plane` (n, 2): slope of the delays along the plane's axes, in units of their sigma.
+    """
+    (a, b), (_, d) = (in_plane.T @ in_plane).tolist()
+    weakest = (a + d) / 2.0 - math.hypot((a - d) / 2.0, b)
+    return min(1.0 / math.sqrt(max(math.sqrt(max(weakest, 0.0)), 1e-12)), 0.5)
+
+
+def _judged(u: F64, a: F64, delay: F64, related: F64, normal: F64, least: float) -> _Fit:
+    """Misfit and sigmas of an answer; `a` and `delay` are in units of the delays' sigma. Nearer to the plane
+    than `least` the sigmas are those of `least`."""
     residual = delay - a @ u
     azimuth, elevation = angles(u)
-    # Where the wave travels in the array's plane, its tilt out of it is seen to second order only. The sigma
-    # of what is seen in the plane bounds it, so the sigmas are taken from that far out of the plane.
-    slope = a @ plane.T
-    in_plane = math.sqrt(float(np.linalg.eigvalsh(slope.T @ slope)[0]))
-    least = min(1.0 / math.sqrt(max(in_plane, 1e-12)), 0.5)
     out = float(u @ normal)
     if abs(out) < least:
         u = u - normal * out
-        u = u / np.linalg.norm(u) * math.sqrt(1.0 - least**2) + normal * math.copysign(least, out)
-    gain = np.linalg.pinv(a @ _tangent(u).T, rcond=1e-9)
-    variance = np.diag(gain @ related @ gain.T)
+        u = u / math.sqrt(u @ u) * math.sqrt(1.0 - least**2) + normal * math.copysign(least, out)
+    gain = _inverse(a @ tangent(u).T)
+    variance = ((gain @ related) * gain).sum(axis=1).tolist()
     return _Fit(
         u,
         float(residual @ residual),

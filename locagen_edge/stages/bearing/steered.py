@@ -47,9 +47,12 @@ FLAT = 0.93
 """Least score over the best from which all directions are alike: noise far louder than what was learnt."""
 SILENCE = 1e-11
 """-110 dBFS mean square in the band: a muted input teaches nothing."""
-RIVAL = 0.95
-"""Score of another lobe over the best from which nobody knows which is true: 0.96 and more for a whistle of
-3 kHz, whose wavelength is shorter than twice the array; under 0.7 for voices."""
+RIVAL = 0.97
+"""Score of another lobe over the best from which nobody knows which is true, however loud the caller: the
+microphones stand where they should to within their tolerance only."""
+CLOSER = 1.5
+"""Roots of the score by which the best lobe has to be ahead of any other: chance gives as much. A whistle of
+3 kHz, whose wavelength is shorter than twice the array, has lobes that are nearly alike; a voice has one."""
 SECOND = 0.2
 """Least score of a second caller beside the first one's, who has to be a call by himself too: below it lies
 what a null leaves of the first."""
@@ -101,6 +104,7 @@ class SteeredLocator:
         self._begin_anew()
         self._onsets = Onsets(self._hop_s)
         self._scores = [0.0 for _ in self._spans_s]
+        self._ratios = [0.0 for _ in self._spans_s]  # how those stand out
         self._strange = [False for _ in self._spans_s]
         self._strange_hops = 0
         self._loud_hops_ago: int | None = None
@@ -141,14 +145,15 @@ class SteeredLocator:
         if elapsed_s > LAG_S:
             self._onsets.forget()
         found = [self._heard(span, elapsed_s) for span in range(len(self._spans_s))]
+        self._ratios = [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
         if self._to_learn > 0:
             return (no_bearing(NAME),)
         self._end_of_a_loud_call()
-        return self._best(found) or (no_bearing(NAME, Evidence(min(max(self._ratios()), MEANING), 0.0)),)
+        return self._best(found) or (no_bearing(NAME, Evidence(min(max(self._ratios), MEANING), 0.0)),)
 
     def _best(self, found: list[list[Source]]) -> tuple[Bearing, ...]:
         """Of the spans: the frame where that is a call by itself, else whichever stands out more."""
-        ratios = self._ratios()
+        ratios = self._ratios
         order = sorted(range(len(found)), key=lambda span: -ratios[span])
         if ratios[0] >= self._least_ratio:
             order = [0, *order]
@@ -168,7 +173,7 @@ class SteeredLocator:
 
     def _end_of_a_loud_call(self) -> None:
         """Who was heard frame by frame and is not any more has stopped: the average begins anew."""
-        if self._ratios()[0] >= self._least_ratio:
+        if self._ratios[0] >= self._least_ratio:
             self._loud_hops_ago = 0
         elif self._loud_hops_ago is not None:
             self._loud_hops_ago += 1
@@ -177,10 +182,6 @@ class SteeredLocator:
                 for span, span_s in enumerate(self._spans_s):
                     if span_s > 0.0:
                         self._search.hear(1.0, span)
-
-    def _ratios(self) -> list[float]:
-        """How the best score of each span stands out."""
-        return [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
 
     def _heard(self, span: int, elapsed_s: float) -> list[Source]:
         """The callers in one span; none where the noise alone is as good a reason."""
@@ -194,11 +195,12 @@ class SteeredLocator:
         scores: F32 = self._search.map(span)
         if span == 0:
             self._onsets.hear(scores)
-        self._scores[span] = max(float(scores.max()), sources[0].score if sources else 0.0)
+        best = float(scores.max())
+        self._scores[span] = max(best, sources[0].score if sources else 0.0)
         self._strange[span] = False
         if not sources:
             return []
-        if sources[0].contrast < LOUDER * sources[0].score or scores.min() > FLAT * scores.max():
+        if sources[0].contrast < LOUDER * sources[0].score or scores.min() > FLAT * best:
             self._scores[span], self._strange[span] = 0.0, True
             return []
         least = max(SECOND * sources[0].score, self._least_ratio * self._usual[span].level)
@@ -215,7 +217,7 @@ class SteeredLocator:
         self._search.weigh(self._weights[span])
         placed = self._sources(span)
         self._search.weigh(np.ones_like(self._weights[span]))
-        too_little = len(placed) < len(found) or placed[0].rival > RIVAL
+        too_little = len(placed) < len(found) or _may_be_elsewhere(placed[0])
         return found if too_little else list(placed[: len(found)])
 
     def _nearest(self, source: Source) -> int:
@@ -223,7 +225,7 @@ class SteeredLocator:
         return int(np.argmax(self._grid_u @ direction(source.azimuth_rad, source.elevation_rad)))
 
     def _told(self, source: Source, span: int, evidence: Evidence) -> Bearing:
-        if source.rival > RIVAL:
+        if _may_be_elsewhere(source):
             return no_bearing(NAME, evidence)
         return self._placed_at(source, span, evidence)
 
@@ -253,7 +255,8 @@ class SteeredLocator:
         seen = arcs @ self._spread_m2 @ arcs.T
         # on the very horizon the second order is left: 1 - cos(error) is what the positions are off by
         seen[1, 1] += 0.5 * self._tolerance * seen[0, 0]
-        scale = self._tolerance_m / math.sqrt(max(float(np.linalg.det(seen)), 1e-18))
+        determinant = float(seen[0, 0] * seen[1, 1] - seen[0, 1] * seen[1, 0])
+        scale = self._tolerance_m / math.sqrt(max(determinant, 1e-18))
         return scale * math.sqrt(seen[1, 1]) / level, scale * math.sqrt(seen[0, 0])
 
     def likeliest(self, span: int = 0) -> Bearing:
@@ -290,7 +293,7 @@ class SteeredLocator:
 
     def _watch(self, call: bool) -> None:
         """What the noise's scores are, put aside until it is sure that they are the noise's."""
-        self._since_lag.append(max(self._ratios()))
+        self._since_lag.append(max(self._ratios))
         self._quiet_hops = 0 if call else self._quiet_hops + 1
         quiet = self._quiet_hops * self._hop_s > PAUSE_S  # a call fades out, and its pauses are no noise
         for span in range(len(self._spans_s)):
@@ -304,3 +307,8 @@ class SteeredLocator:
             usual.learn(score, self._elapsed_s)
         if not self._usual[0].young and max(self._since_lag) < self._least_ratio:
             self._onsets.learn(self._lag, self._elapsed_s)
+
+
+def _may_be_elsewhere(source: Source) -> bool:
+    """Whether another lobe explains what was heard nearly as well."""
+    return source.rival > min(RIVAL, 1.0 - CLOSER / math.sqrt(max(source.score, 1.0)))

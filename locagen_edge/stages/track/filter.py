@@ -8,6 +8,8 @@ algorithms with sound state representations through encapsulation of manifolds",
 are kept as vectors of the axes themselves, covariance singular along the direction: no basis has to be
 carried along, and other axes are one rotation away.
 
+A call of numpy costs as much as ten sums of plain floats: what has two or three elements is written out.
+
 The rate is an angular velocity with white-noise acceleration (Bar-Shalom, Li & Kirubarajan, *Estimation with
 Applications to Tracking and Navigation*, section 6.2), about whatever makes bearings move:
 
@@ -24,7 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from locagen_edge.geometry import angles, direction, wrap
+from locagen_edge.geometry import angles, direction, tangent, wrap
 from locagen_edge.settings import TrackSettings
 from locagen_edge.types import F64, Bearing
 
@@ -39,7 +41,9 @@ LEAST_SHARE = 0.1
 
 
 _EYE: F64 = np.eye(3)
+_EYE6: F64 = np.eye(6)
 _LEVEL: F64 = np.diag([1.0, 1.0, 0.0])
+_UPRIGHT: F64 = np.diag([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +61,7 @@ class Motion:
 
     def axes(self, u: F64) -> F64:
         """(3, 3) projection to the axes about which a direction u can be moving."""
-        if self.great_circle:
-            return np.eye(3) - np.outer(u, u)
-        return np.diag([0.0, 0.0, 1.0])
+        return _EYE - u[:, None] * u if self.great_circle else _UPRIGHT
 
 
 def body_motion(settings: TrackSettings) -> Motion:
@@ -122,13 +124,6 @@ def mirrored(m: Measurement, normal: F64) -> Measurement:
     return replace(m, azimuth=azimuth, elevation=elevation)
 
 
-def tangent(u: F64) -> F64:
-    """(2, 3): across a direction, level with the horizon (clockwise) and towards the zenith."""
-    flat = math.hypot(u[0], u[1])
-    level = np.array([-u[1], u[0], 0.0]) / flat if flat > 1e-9 else np.array([0.0, 1.0, 0.0])
-    return np.stack([level, _cross(level) @ u])
-
-
 def born(m: Measurement, motion: Motion) -> State:
     u = direction(m.azimuth, m.elevation or 0.0)
     up = UNKNOWN_ELEVATION_RAD**2 if m.elevation is None else min(m.up_variance, UNKNOWN_ELEVATION_RAD**2)
@@ -145,18 +140,22 @@ def predicted(state: State, motion: Motion, dt: float) -> State:
     turn = _turn(state.rate * dt)
     u = turn @ state.u
     lever = -_cross(u)  # an error of the rate moves u by error x u = -(u x error)
-    f = np.zeros((6, 6))
+    f = _EYE6.copy()
     f[:3, :3] = turn
     f[:3, 3:] = lever * dt
-    f[3:, 3:] = turn if motion.great_circle else _EYE
+    if motion.great_circle:
+        f[3:, 3:] = turn
     axes = motion.axes(u)
-    q = np.zeros((6, 6))
-    q[:3, :3] = lever @ axes @ lever.T * (motion.agility_rad**2 * dt**3 / 3)
-    q[:3, :3] += lever @ _LEVEL @ lever.T * (motion.wobble_rad**2 * dt)
-    q[:3, 3:] = lever @ axes * (motion.agility_rad**2 * dt**2 / 2)
-    q[3:, :3] = q[:3, 3:].T
-    q[3:, 3:] = axes * (motion.agility_rad**2 * dt)
-    return State(u, f[3:, 3:] @ state.rate, f @ state.p @ f.T + q)
+    moved = lever @ axes
+    cross = moved * (motion.agility_rad**2 * dt**2 / 2)
+    p: F64 = f @ state.p @ f.T
+    p[:3, :3] += moved @ lever.T * (motion.agility_rad**2 * dt**3 / 3)
+    if motion.wobble_rad:
+        p[:3, :3] += lever @ _LEVEL @ lever.T * (motion.wobble_rad**2 * dt)
+    p[:3, 3:] += cross
+    p[3:, :3] += cross.T
+    p[3:, 3:] += axes * (motion.agility_rad**2 * dt)
+    return State(u, f[3:, 3:] @ state.rate, p)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,53 +169,60 @@ class Innovation:
     """(n,) rad"""
     noise: F64
     """(n, n) rad^2, of the measurement alone"""
-    gate: F64
-    """(n, n) rad^2, of measurement and state, with what does not average out"""
-
-    @property
-    def distance2(self) -> float:
-        """Squared Mahalanobis distance."""
-        return float(self.off @ np.linalg.solve(self.gate, self.off))
-
-    @property
-    def cost(self) -> float:
-        """Twice the negative log-likelihood but for a constant: a wide state does not win by being wide."""
-        return self.distance2 + float(np.log(np.linalg.det(self.gate)))
+    distance2: float
+    """squared Mahalanobis distance, of measurement and state, with what does not average out"""
+    cost: float
+    """twice the negative log-likelihood but for a constant: a wide state does not win by being wide"""
 
 
 def innovation(state: State, m: Measurement) -> Innovation:
     here = m.turn.T @ state.u  # as the body sees it
+    basis = tangent(here)
+    variances = np.array([m.level_variance, m.up_variance])
     if m.elevation is not None and m.up_variance <= LOCAL_RAD**2:
         there = direction(m.azimuth, m.elevation)
-        basis, carry = tangent(here), _carry(there, here)
         off = basis @ _log(here, there)
-        rows = basis @ carry @ tangent(there).T
-        noise = rows @ np.diag([m.level_variance, m.up_variance]) @ rows.T
+        rows = basis @ _carry(there, here) @ tangent(there).T
+        noise = rows * variances @ rows.T
     else:
         azimuth, elevation = angles(here)
-        basis = tangent(here)
         off = np.array([wrap(m.azimuth - azimuth) * math.cos(elevation), (m.elevation or 0.0) - elevation])
-        noise = np.diag([m.level_variance, m.up_variance])
+        noise = np.diag(variances)
         if m.elevation is None:
             basis, off, noise = basis[:1], off[:1], noise[:1, :1]
     basis = basis @ m.turn.T
-    gate = basis @ state.p[:3, :3] @ basis.T + noise + m.fixed_variance * np.eye(len(off))
-    return Innovation(m, basis, off, noise, gate)
+    gate = basis @ state.p[:3, :3] @ basis.T + noise
+    distance2, determinant = _against(off, gate, m.fixed_variance)
+    return Innovation(m, basis, off, noise, distance2, distance2 + math.log(determinant))
+
+
+def _against(off: F64, variance: F64, more: float) -> tuple[float, float]:
+    """Squared Mahalanobis distance of off (n,) and the determinant of its variance (n, n), which has `more`
+    on its diagonal; n is 1 or 2."""
+    if len(off) == 1:
+        x, total = float(off[0]), float(variance[0, 0]) + more
+        return x * x / total, total
+    (a, b), (_, d) = variance.tolist()
+    a, d = a + more, d + more
+    x, y = off.tolist()
+    determinant = max(a * d - b * b, 1e-300)  # above zero but for rounding
+    return (d * x * x - 2.0 * b * x * y + a * y * y) / determinant, determinant
 
 
 def updated(state: State, i: Innovation, motion: Motion) -> State:
     """The state with a measurement in it."""
-    h = np.hstack([i.basis, np.zeros_like(i.basis)])
-    ph = state.p @ h.T
-    gain = np.linalg.solve(h @ ph + i.noise, ph.T).T
+    ph = state.p[:, :3] @ i.basis.T  # the measurement sees the direction alone
+    gain = np.linalg.solve(i.basis @ ph[:3] + i.noise, ph.T).T
     correction = gain @ i.off
-    keep = np.eye(6) - gain @ h
+    keep = _EYE6.copy()
+    keep[:, :3] -= gain @ i.basis
     p = keep @ state.p @ keep.T + gain @ i.noise @ gain.T  # Joseph: stays symmetric and positive
     u = _exp(state.u, correction[:3])
-    carry = np.eye(6)
-    carry[:3, :3] = _carry(state.u, u)
+    turn = _carry(state.u, u)
+    carry = _EYE6.copy()
+    carry[:3, :3] = turn
     if motion.great_circle:
-        carry[3:, 3:] = carry[:3, :3]
+        carry[3:, 3:] = turn
     return State(u, carry[3:, 3:] @ (state.rate + correction[3:]), carry @ p @ carry.T)
 
 
@@ -237,36 +243,46 @@ def in_other_axes(state: State, turn: F64, motion: Motion) -> State:
 
 def _cross(v: F64) -> F64:
     """(3, 3) matrix of v x."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    return _skew(*v.tolist())
+
+
+def _skew(x: float, y: float, z: float) -> F64:
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _sinc(angle: float) -> float:
+    """sin(angle) / angle."""
+    return math.sin(angle) / angle if angle else 1.0
 
 
 def _turn(v: F64) -> F64:
     """(3, 3) rotation about v by |v| radians (Rodrigues)."""
-    angle = float(np.linalg.norm(v))
+    angle = math.sqrt(v @ v)
     k = _cross(v)
-    # sinc with its limit at 0, and (1 - cos) / angle^2 as half a squared sinc
-    rotated: F64 = np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (k @ k)
+    # (1 - cos) / angle^2 as half a squared sinc
+    rotated: F64 = _EYE + _sinc(angle) * k + 0.5 * _sinc(angle / 2.0) ** 2 * (k @ k)
     return rotated
 
 
 def _carry(a: F64, b: F64) -> F64:
     """(3, 3) the shortest rotation from unit vector a to b: carries what is tangent at a to b."""
-    k = _cross(_cross(a) @ b)
-    rotated: F64 = np.eye(3) + k + k @ k / max(1.0 + float(a @ b), 1e-9)
+    x, y, z = a.tolist()
+    p, q, r = b.tolist()
+    k = _skew(y * r - z * q, z * p - x * r, x * q - y * p)
+    rotated: F64 = _EYE + k + k @ k / max(1.0 + x * p + y * q + z * r, 1e-9)
     return rotated
 
 
 def _log(a: F64, b: F64) -> F64:
     """(3,) tangent at a whose length is the angle to b, and which points there."""
-    across = b - a * float(a @ b)
-    sine = float(np.linalg.norm(across))
-    scaled: F64 = across * (math.atan2(sine, float(a @ b)) / sine) if sine > 1e-12 else across
-    return scaled
+    cosine = float(a @ b)
+    across: F64 = b - a * cosine
+    sine = math.sqrt(across @ across)
+    return across * (math.atan2(sine, cosine) / sine) if sine > 1e-12 else across
 
 
 def _exp(u: F64, step: F64) -> F64:
     """The unit vector that lies |step| radians from u along a tangent."""
-    angle = float(np.linalg.norm(step))
-    moved = u * math.cos(angle) + step * float(np.sinc(angle / np.pi))
-    unit: F64 = moved / np.linalg.norm(moved)
-    return unit
+    angle = math.sqrt(step @ step)
+    moved: F64 = u * math.cos(angle) + step * _sinc(angle)
+    return moved / math.sqrt(moved @ moved)

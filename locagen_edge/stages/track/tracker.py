@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from locagen_edge.geometry import angles, direction, rotation
+from locagen_edge.geometry import angles, direction, rotation, tangent
 from locagen_edge.settings import PoseSettings, TrackSettings
 from locagen_edge.stages.track import filter as sphere
 from locagen_edge.stages.track.association import associate
@@ -45,6 +45,8 @@ SWELL_S = 0.02
 """1-sigma of the moment within a frame of 0.1 s from which most of its sound comes."""
 NOWHERE_RAD = math.pi / math.sqrt(3.0)
 """1-sigma of an angle that may be anything."""
+AS_IT_IS: F64 = np.eye(3)
+"""body -> earth, where the attitude is not known"""
 
 
 @dataclass(slots=True)
@@ -146,7 +148,7 @@ class Tracker:
         if before is None:
             self._change_axes(turn)
             return 0.0
-        return math.acos(min(max((float(np.trace(before.T @ turn)) - 1.0) / 2.0, -1.0), 1.0))
+        return math.acos(min(max((float(np.vdot(before, turn)) - 1.0) / 2.0, -1.0), 1.0))  # trace of b^T t
 
     def _change_axes(self, turn: F64) -> None:
         for caller in self._callers:
@@ -155,7 +157,7 @@ class Tracker:
     # --- what is heard
 
     def _hear(self, bearings: list[Bearing], rate: float, dt: float) -> None:
-        turn = np.eye(3) if self._turn is None else self._turn
+        turn = AS_IT_IS if self._turn is None else self._turn
         measurements = [
             sphere.measured(
                 b,
@@ -243,7 +245,7 @@ class Tracker:
     # --- what is told
 
     def _told(self, caller: _Caller) -> Track:
-        turn = np.eye(3) if self._turn is None else self._turn
+        turn = AS_IT_IS if self._turn is None else self._turn
         azimuth, azimuth_sigma, elevation, elevation_sigma = self._seen(caller, turn.T)
         return Track(
             azimuth_rad=azimuth,
@@ -263,7 +265,7 @@ class Tracker:
         _, slope = angles(caller.state.u)
         # leaning by a wrong angle moves what is below sideways, and what is level up and down
         azimuth, azimuth_sigma, elevation, elevation_sigma = self._seen(
-            caller, np.eye(3), level=(self._tilt * math.sin(slope)) ** 2, up=self._tilt**2
+            caller, AS_IT_IS, level=(self._tilt * math.sin(slope)) ** 2, up=self._tilt**2
         )
         azimuth_sigma = min(math.hypot(azimuth_sigma, self._compass), NOWHERE_RAD)
         return TrueBearing(azimuth, azimuth_sigma, elevation, elevation_sigma)
@@ -275,8 +277,8 @@ class Tracker:
         here = direction(m.azimuth, m.elevation or 0.0)
         there = self._turn @ here
         azimuth, elevation = angles(there)
-        rows = sphere.tangent(there) @ self._turn @ sphere.tangent(here).T
-        level, up = np.diag(rows @ np.diag([m.level_variance, m.up_variance]) @ rows.T)
+        rows = tangent(there) @ self._turn @ tangent(here).T
+        level, up = (rows**2 @ np.array([m.level_variance, m.up_variance])).tolist()
         azimuth_sigma = min(math.sqrt(level) / max(math.cos(elevation), 1e-9), NOWHERE_RAD)
         known = m.elevation is not None
         elevation_sigma = min(math.sqrt(up), NOWHERE_RAD) if known else NOWHERE_RAD
@@ -289,8 +291,8 @@ class Tracker:
         variances on top, rad^2 across the direction."""
         u = turn @ caller.state.u
         azimuth, elevation = angles(u)
-        across = sphere.tangent(u) @ turn
-        variance = np.diag(across @ caller.state.p[:3, :3] @ across.T) + self._fixed
+        across = tangent(u) @ turn
+        variance = ((across @ caller.state.p[:3, :3] * across).sum(axis=1) + self._fixed).tolist()
         azimuth_sigma = math.sqrt(variance[0] + level) / max(math.cos(elevation), 1e-9)
         if not caller.elevation_known:
             return azimuth, min(azimuth_sigma, NOWHERE_RAD), None, NOWHERE_RAD
