@@ -21,17 +21,22 @@ from locagen_edge.sim import calls
 from locagen_edge.sim.rotors import rotor
 from locagen_edge.stages.denoise import (
     CHUNK,
+    FLOOR,
     HIGH_PASS_HZ,
     LOOKAHEAD,
     MASK_DELAY,
     RATE_HZ,
+    SMOOTH_STEPS,
+    STEP,
     WAVE_DELAY,
     MaskDenoiser,
     MaskStream,
     NoiseSpectrum,
+    Presence,
     WaveDenoiser,
     WaveStream,
     WienerDenoiser,
+    decision_directed,
     finite,
 )
 
@@ -64,6 +69,75 @@ class Passing:
 
     def __call__(self, inputs: list) -> list:
         return [np.ones_like(inputs[0]), inputs[-1]]
+
+
+class Delaying:
+    """A waveform network that keeps this much of the sound, WAVE_DELAY later."""
+
+    def __init__(self, gain: float) -> None:
+        self.gain = gain
+
+    def zeros(self, mics: int) -> list:
+        return [np.zeros((mics, WAVE_DELAY), np.float32)]
+
+    def __call__(self, inputs: list) -> list:
+        both = np.concatenate(inputs[::-1], axis=1)
+        return [np.float32(self.gain) * both[:, :CHUNK], both[:, CHUNK:]]
+
+
+# --- presence and floor -------------------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=30), st.floats(0.0, 0.5), st.floats(1e-6, 1.0))
+@settings(max_examples=30)
+def test_keeping_more_is_never_less_of_a_call(shares: list[float], more: float, noise: float) -> None:
+    share = np.array([shares])
+    low, high = (Presence(1, (2.0, 4.0))(x, noise) for x in (share, np.minimum(share + more, 1.0)))
+    assert ((low >= 0.0) & (high <= 1.0) & (low <= high)).all()
+
+
+def test_presence_is_smooth_over_its_steps() -> None:
+    """After SMOOTH_STEPS of a share of 1 it has come 1 - 1/e of the way from nothing."""
+    share = np.ones((1, SMOOTH_STEPS))
+    half = 1.0 - (1.0 - 1.0 / SMOOTH_STEPS) ** SMOOTH_STEPS
+    at_db = 10.0 * np.log10(half)
+    assert Presence(1, (at_db - 1.0, at_db + 1.0))(share)[0, -1] == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize(("kept", "left"), [(0.0, FLOOR), (0.01, FLOOR), (1.0, 1.0)])
+def test_the_floor_is_the_sound_as_it_came(kept: float, left: float) -> None:
+    """A network that finds nothing leaves its input, 20 dB down; one that keeps all leaves it as it is."""
+    sound = np.random.default_rng(1).standard_normal((MICS, 10 * CHUNK)).astype(np.float32)
+    out = WaveStream(Delaying(kept), MICS)(sound)  # type: ignore[arg-type]
+    settled = 4 * CHUNK
+    wanted = left * sound[:, settled - WAVE_DELAY : -WAVE_DELAY]
+    np.testing.assert_allclose(out[:, settled:], wanted, atol=1e-5)
+
+
+def test_the_floor_opens_and_closes_without_a_click() -> None:
+    """What the gain does between two samples is at most a STEP's part of all it can do."""
+    network = Delaying(0.0)
+    stream = WaveStream(network, 1)  # type: ignore[arg-type]
+    gains = []
+    for network.gain in [0.0] * 4 + [1.0] * 4 + [0.0] * 4:
+        gains.append(stream(np.ones((1, CHUNK), np.float32))[0])
+    found = np.concatenate(gains)[CHUNK:]
+    inner = np.delete(np.abs(np.diff(found)), np.arange(1, 11) * CHUNK - 1)  # this network itself clicks
+    assert inner.max() <= 1.0 / STEP + 1e-6
+    assert found.max() == pytest.approx(1.0, abs=1e-5)
+    assert found[-1] == pytest.approx(FLOOR, abs=1e-5)
+
+
+@given(st.lists(st.floats(0.0, 1e12), min_size=2, max_size=40))
+@settings(max_examples=30)
+def test_wieners_gain_is_one_stream_however_it_is_cut(values: list[float]) -> None:
+    power = np.array(values)[:, np.newaxis]
+    whole, kept = decision_directed(power, np.zeros(1))
+    first, between = decision_directed(power[:1], np.zeros(1))
+    rest, last = decision_directed(power[1:], between)
+    np.testing.assert_array_equal(whole, np.concatenate([first, rest]))
+    np.testing.assert_array_equal(kept, last)
+    assert ((whole > 0.0) & (whole <= 1.0)).all()
 
 
 # --- the high-pass ------------------------------------------------------------------------------------
@@ -241,6 +315,49 @@ def test_it_keeps_the_whistle_and_not_the_rotors(told: MaskDenoiser) -> None:
     assert ((call.weight >= 0.0) & (call.weight <= 1.0)).all()
     assert call.weight.shape == (513,)
     assert call.masks.shape == (7 - LOOKAHEAD, 129)
+
+
+def listen(sound: np.ndarray, noise_chunks: int) -> np.ndarray:
+    """What a person hears of a stream whose first chunks are taken as noise, MASK_DELAY taken out."""
+    stream = MaskStream(load_network(MASK.denoise.mask, MASK), MICS)
+    out = []
+    for first in range(0, sound.shape[1], CHUNK):
+        spectra, mask = stream(sound[:, first : first + CHUNK].astype(np.float32))
+        out.append(stream.cleaned(spectra, mask))
+        if first < noise_chunks * CHUNK:
+            stream.learn()
+    return np.concatenate(out, axis=1)[:, MASK_DELAY:]
+
+
+def test_a_person_hears_the_rotors_20_db_down_and_the_whistle() -> None:
+    noise = rotors(120 * CHUNK, 1)
+    call = whistle(120 * CHUNK, 0.1)
+    call[: 80 * CHUNK] = 0.0
+    out = listen(noise + call, 60)
+    rest, calling = (slice(a * CHUNK, b * CHUNK) for a, b in ((62, 78), (90, 115)))
+
+    def level(part: slice) -> float:
+        return float(10.0 * np.log10(np.mean(out[:, part] ** 2) / np.mean(noise[:, part] ** 2)))
+
+    assert level(rest) == pytest.approx(20.0 * np.log10(FLOOR), abs=1.5)  # it opens for moments
+    gain = out[0, calling] @ call[calling] / (call[calling] @ call[calling])
+    assert gain > 0.8
+
+
+def test_every_microphone_is_heard_by_the_same_gain() -> None:
+    sound = rotors(60 * CHUNK, 1)[:1] + whistle(60 * CHUNK, 0.05)
+    out = listen(np.concatenate([sound, -0.5 * sound, sound]), 30)
+    np.testing.assert_allclose(out[1], -0.5 * out[0], atol=1e-6)
+
+
+def test_silence_and_what_is_no_number_end_with_themselves() -> None:
+    sound = rotors(120 * CHUNK, 1)
+    broken = sound.copy()
+    broken[:, 70 * CHUNK : 72 * CHUNK] = finite(np.full((MICS, 2 * CHUNK), np.inf, np.float32))
+    broken[:, 72 * CHUNK : 74 * CHUNK] = 0.0
+    whole, found = listen(sound, 60), listen(broken, 60)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found[:, 110 * CHUNK :], whole[:, 110 * CHUNK :], atol=2e-3)  # of 0.05
 
 
 def test_level_does_not_matter() -> None:

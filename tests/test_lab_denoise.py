@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import pytest
 import soundfile
@@ -17,11 +19,13 @@ from locagen_edge.lab.denoise.cases import Case, cases, with_array
 from locagen_edge.lab.denoise.mixes import Mixer, length
 from locagen_edge.lab.denoise.peers import PEERS, peers, sound_of, spectra_of, wiener, wiener_plain
 from locagen_edge.lab.denoise.publish import parity, publish, weights_of
+from locagen_edge.lab.denoise.tune import halfway
 from locagen_edge.lab.nets.mask import BINS, LOOKAHEAD, MaskNet
 from locagen_edge.lab.nets.wave import STRIDE, WaveNet
 from locagen_edge.lab.settings import LabSettings, read
 from locagen_edge.models import default_directory, load_network
 from locagen_edge.sim.levels import band_power, to_db
+from locagen_edge.sim.rotors import rotor
 from locagen_edge.stages.denoise import RATE_HZ
 
 MOST_PARAMETERS = 100_000
@@ -92,6 +96,23 @@ def test_a_network_that_deletes_the_caller_is_found_out() -> None:
     assert improved < -20.0
     _, improved, gain, _ = evaluate.score(clean + noise, np.zeros_like(clean), clean)
     assert (gain, improved) == (0.0, pytest.approx(0.0, abs=0.1))
+
+
+@pytest.mark.parametrize("caller", list(CALLERS))
+def test_what_cannot_be_heard_is_not_made_worse(caller: str) -> None:
+    """At -40 dB under rotors nothing can be found, and then the output is the input."""
+    s = LabSettings()
+    rng = np.random.default_rng(5)
+    made = rotor(0.5, float(s.audio.rate_hz), 4700.0, rng)
+    noise = np.concatenate(list(islice(made, 8)))[:50_176].astype(np.float32)
+    noise /= np.sqrt(np.mean(noise**2))
+    call = CALLERS[caller](25_088, float(s.audio.rate_hz), 4700.0, rng).astype(np.float32)
+    call /= np.sqrt(np.mean(call**2))
+    sound, clean = Case(caller, "rotor", noise[:25_088], noise[25_088:], call).mixture(-40.0)
+    inner = slice(1024, -1024)
+    out = evaluate.mask_method("denoise-mask", s)(sound, 25_088)[25_088:]
+    _, improved, _, _ = evaluate.score(sound[25_088:][inner], out[inner], clean[inner])
+    assert improved >= evaluate.WORSE_DB
 
 
 # --- networks -----------------------------------------------------------------------------------------
@@ -234,6 +255,12 @@ def assert_delays(call: np.ndarray, delay_s: np.ndarray, s: LabSettings) -> None
     for (i, j), wanted in zip(s.mic_array.pairs, delay_s, strict=True):
         phase = np.angle(spectra[j, at] * np.conj(spectra[i, at]) * np.exp(2j * np.pi * hertz * wanted))
         assert abs(phase) < 0.05
+
+
+def test_what_is_tuned_stays_halfway_to_what_it_was() -> None:
+    base, tuned = ({"w": torch.full((2,), x)} for x in (1.0, 4.0))
+    assert torch.equal(halfway(base, tuned)["w"], torch.full((2,), 2.5))
+    assert torch.equal(halfway(base, base)["w"], base["w"])
 
 
 # --- peers --------------------------------------------------------------------------------------------

@@ -53,6 +53,17 @@ LEAST = 1e-17
 EARLIEST_S = 0.5
 """Noise that has to be known before a mask is given; it then still varies by 2 dB from bin to bin."""
 
+FLOOR = 0.1
+"""Of the sound as it came, -20 dB, that stays in cleaned sound: what the networks miss is not lost, and where
+they find nothing the output is the input, quieter, instead of what they make of noise."""
+SMOOTH_STEPS = 8
+"""STEPs over which the share of power that is kept is averaged, 0.1 s"""
+WAVE_CALLS_DB = (-17.5, -13.5)
+"""Share of its input's power that the waveform network keeps, without and with a call. Of recorded rotors
+alone it keeps -26 dB, for moments up to -12; of calls as loud as they -11 dB and more."""
+MASK_CALLS_DB = (2.0, 4.0)
+"""The same of the mask, over what it keeps of the noise alone: that is -11 to -20 dB, as the drone is."""
+
 
 def window() -> F64:
     """(WINDOW,) square root of Hann: twice applied and overlapped by half it adds up to 1."""
@@ -87,11 +98,31 @@ def finite(sound: F32) -> F32:
     return np.clip(np.where(np.isfinite(sound), sound, np.float32(0.0)), -LOUDEST, LOUDEST)
 
 
+class Presence:
+    """How sure it is that something calls, 0 to 1, from the share of its power that a sound keeps: smoothed,
+    in dB, between two levels (as Cohen & Berdugo, Signal Processing 81 (2001) 2403-2418, do it with the SNR
+    of a frame)."""
+
+    def __init__(self, rows: int, levels_db: tuple[float, float]) -> None:
+        self._low_db, high_db = levels_db
+        self._span_db = high_db - self._low_db
+        self._kept: F64 = np.zeros(rows)
+
+    def __call__(self, share: F64, noise_share: float = 1.0) -> F64:
+        """Of (rows, steps), each 0 to 1: the same shape. The levels are over `noise_share`."""
+        smooth = np.empty_like(share)
+        for k in range(share.shape[1]):
+            self._kept = self._kept + (share[:, k] - self._kept) / SMOOTH_STEPS
+            smooth[:, k] = self._kept
+        over_db = 10.0 * np.log10((smooth + LEAST) / (noise_share + LEAST))
+        return np.clip((over_db - self._low_db) / self._span_db, 0.0, 1.0)
+
+
 # --- wave ---------------------------------------------------------------------------------------------
 
 
 class WaveStream:
-    """The waveform network over chunks of a stream."""
+    """The waveform network over chunks of a stream, and the floor under it."""
 
     def __init__(self, network: Network, mics: int) -> None:
         self._network = network
@@ -101,6 +132,9 @@ class WaveStream:
     def reset(self) -> None:
         """Silence before the next chunk."""
         self._states = self._network.zeros(mics=self._mics)
+        self._late: F32 = np.zeros((self._mics, WAVE_DELAY), dtype=np.float32)
+        self._presence = Presence(self._mics, WAVE_CALLS_DB)
+        self._sure: F64 = np.zeros((self._mics, 1))
 
     def __call__(self, sound: F32) -> F32:
         """(mics, CHUNK * k) to the clean sound WAVE_DELAY earlier, (mics, CHUNK * k)."""
@@ -108,7 +142,21 @@ class WaveStream:
         for first in range(0, sound.shape[1], CHUNK):
             out, *self._states = self._network([sound[:, first : first + CHUNK], *self._states])
             clean.append(out)
-        return np.concatenate(clean, axis=1)
+        return self._floored(np.concatenate(clean, axis=1), sound)
+
+    def _floored(self, clean: F32, sound: F32) -> F32:
+        """What the network gave by how sure it is of a call, each microphone for itself, over the floor."""
+        both = np.concatenate([self._late, sound], axis=1)
+        late, self._late = both[:, : sound.shape[1]], both[:, sound.shape[1] :]
+        kept, whole = (
+            np.square(x.reshape(self._mics, -1, STEP), dtype=np.float64).sum(axis=2) for x in (clean, late)
+        )
+        sure = np.concatenate([self._sure, self._presence(np.minimum(kept / (whole + LEAST), 1.0))], axis=1)
+        self._sure = sure[:, -1:]
+        rising = (np.arange(STEP) + 1.0) / STEP  # from one step's to the next's: no clicks
+        gain = sure[:, :-1, np.newaxis] + np.diff(sure)[:, :, np.newaxis] * rising
+        gain = (1.0 - FLOOR) * gain.reshape(self._mics, -1)
+        return np.asarray(FLOOR * late + gain * clean, dtype=np.float32)
 
 
 class WaveDenoiser:
@@ -179,6 +227,60 @@ class NoiseSpectrum:
         return relative, (known / known.sum(axis=1, keepdims=True)).mean(axis=0)
 
 
+LEAST_PRIOR = 10.0 ** (-25.0 / 10.0)
+"""Least a-priori SNR of Wiener's gain, against musical noise (Cappe, IEEE Trans. SAP 2 (1994) 345-349)."""
+PRIOR_SMOOTHING = 0.9
+
+
+def decision_directed(relative: F64, kept: F64) -> tuple[F64, F64]:
+    """Wiener's gain of power over noise (spectra, bins), the SNR before each from the output before it
+    (Ephraim & Malah, IEEE Trans. ASSP 32 (1984) 1109-1121). `kept` (bins,): that output's power over noise,
+    zeros at first; returned again for the next call.
+    """
+    gains = np.empty_like(relative)
+    for k, row in enumerate(relative):
+        prior = PRIOR_SMOOTHING * kept + (1.0 - PRIOR_SMOOTHING) * np.maximum(row - 1.0, 0.0)
+        prior = np.maximum(prior, LEAST_PRIOR)
+        gains[k] = prior / (1.0 + prior)
+        kept = np.square(gains[k]) * row
+    return gains, kept
+
+
+class Listening:
+    """The gain of the sound that a person hears: where something calls, the geometric mean of the mask and of
+    Wiener's gain, which is better than either; where nothing does, FLOOR.
+
+    Two that err apart: the network knows calls but not this drone, Wiener's gain this drone but no calls.
+    """
+
+    def __init__(self, forget_spectra: float) -> None:
+        self._noise_share = NoiseSpectrum(1, forget_spectra, 1)
+        self._earliest = EARLIEST_S * RATE_HZ / STEP
+        self.reset()
+
+    def reset(self) -> None:
+        """Silence before the next spectra; what the mask keeps of the noise stays known."""
+        self._kept: F64 = np.zeros(BINS + 1)
+        self._presence = Presence(1, MASK_CALLS_DB)
+        self._share: F64 = np.zeros((1, 0))
+
+    def __call__(self, power: F64, relative: F64, mask: F32) -> F64:
+        """Of power, power over noise and mask, all (spectra, bins): the gain, the same shape."""
+        whole = power.sum(axis=1)
+        self._share = ((mask * power).sum(axis=1) / (whole + LEAST))[np.newaxis]
+        wiener, self._kept = decision_directed(relative, self._kept)
+        gain = np.sqrt(mask * wiener)
+        if self._noise_share.spectra[0] < self._earliest:
+            return gain
+        sure = self._presence(self._share, float(self._noise_share.mean[0, 0]))[0][:, np.newaxis]
+        return np.asarray(sure * gain + (1.0 - sure) * FLOOR)
+
+    def learn(self) -> None:
+        """The last spectra were noise."""
+        self._noise_share.learn(self._share[:, :, np.newaxis])
+        self._share = self._share[:, :0]
+
+
 class MaskStream:
     """The mask network over chunks of a stream."""
 
@@ -188,12 +290,14 @@ class MaskStream:
         self._mics = mics
         self.noise = NoiseSpectrum(mics, forget_s * RATE_HZ / STEP)
         self._earliest = EARLIEST_S * RATE_HZ / STEP
+        self._listening = Listening(forget_s * RATE_HZ / STEP)
         self.power: F64 = np.zeros((mics, 0, BINS + 1))
         """(mics, spectra, bins) of the last chunks"""
         self.reset()
 
     def reset(self) -> None:
         """Silence before the next chunk; the noise stays known."""
+        self._listening.reset()
         self._states = self._network.zeros()
         self._held: F32 = np.zeros((self._mics, WINDOW - STEP), dtype=np.float32)
         self._waiting = np.zeros((self._mics, LOOKAHEAD, BINS + 1), dtype=np.complex64)
@@ -231,11 +335,23 @@ class MaskStream:
         mask[:, 0] = 0.0
         return mask
 
+    def learn(self) -> None:
+        """Takes the last chunks as noise."""
+        self.noise.learn(self.power)
+        # a network that has heard noise for a while: its mask of the first moments says nothing
+        if self.noise.spectra.max() >= 2.0 * self._earliest:
+            self._listening.learn()
+
     def cleaned(self, spectra: Array, mask: F32) -> F32:
-        """The sound MASK_DELAY before the chunk that both came of: (mics, CHUNK * k)."""
+        """The sound MASK_DELAY before the chunk that both came of: (mics, CHUNK * k), every microphone's with
+        the same gain (`Listening`); as it came where the noise is not known."""
         waiting = np.concatenate([self._waiting, spectra], axis=1)
         self._waiting = waiting[:, spectra.shape[1] :]
-        pieces = np.fft.irfft(waiting[:, : spectra.shape[1]] * mask, axis=2) * self._taper
+        now = waiting[:, : spectra.shape[1]]
+        power = np.square(now.real, dtype=np.float64) + np.square(now.imag, dtype=np.float64)
+        heard = self.noise.relative(power, self._earliest)
+        gain = mask if heard is None else self._listening(power.mean(axis=0), heard[0], mask)
+        pieces = np.fft.irfft(now * gain, axis=2) * self._taper
         before = np.concatenate([self._overlap[:, np.newaxis], pieces[:, :-1, STEP:]], axis=1)
         self._overlap = pieces[:, -1, STEP:]
         clean: F32 = (pieces[:, :, :STEP] + before).reshape(self._mics, -1).astype(np.float32)
@@ -255,7 +371,6 @@ class MaskDenoiser:
         per_frame = (audio.frame - WINDOW) // STEP + 1
         self._masks: F32 = np.ones((per_frame, BINS + 1), dtype=np.float32)
         self._power: F64 = np.zeros((per_frame, BINS + 1))
-        self._ended: F64 = np.zeros((mics, 0, BINS + 1))
         at = np.arange(audio.frame // 2 + 1) * (WINDOW / audio.frame)
         self._low = np.minimum(at.astype(np.intp), BINS - 1)
         self._share = (at - self._low).astype(np.float32)
@@ -270,7 +385,7 @@ class MaskDenoiser:
             self._masks[:] = 1.0
             self._power[:] = 0.0
         _, mask = self._stream(sound)
-        self._ended = power = self._stream.power
+        power = self._stream.power
         self._masks = np.concatenate([self._masks, mask])[-len(self._masks) :]
         self._power = np.concatenate([self._power, power.mean(axis=0)])[-len(self._power) :]
         # mask k belongs to the spectrum LOOKAHEAD before: the frame's first ones have theirs
@@ -290,7 +405,7 @@ class MaskDenoiser:
     def settle(self, call: bool, /) -> None:
         """Learns the frame's new spectra as noise where it held no call."""
         if not call:
-            self._stream.noise.learn(self._ended)
+            self._stream.learn()
 
 
 # --- Wiener -------------------------------------------------------------------------------------------

@@ -12,15 +12,10 @@ from collections.abc import Callable
 import numpy as np
 import soxr
 
-from locagen_edge.stages.denoise import RATE_HZ, STEP, WINDOW, window
+from locagen_edge.stages.denoise import RATE_HZ, STEP, WINDOW, decision_directed, window
 from locagen_edge.types import F32, Array
 
 Method = Callable[[F32, int], F32]
-
-FLOOR = 10.0 ** (-25.0 / 10.0)
-"""Least a-priori SNR of the Wiener filter, against musical noise (Cappe, IEEE Trans. SAP 2 (1994) 345-349).
-"""
-SMOOTHING = 0.9
 
 
 def spectra_of(sound: F32) -> Array:
@@ -39,18 +34,10 @@ def sound_of(spectra: Array, n: int) -> F32:
 
 
 def wiener(sound: F32, before: int) -> F32:
-    """Wiener's gain with the spectrum of the noise before, decision-directed a-priori SNR (Ephraim & Malah,
-    IEEE Trans. ASSP 32 (1984) 1109-1121).
-    """
+    """Wiener's gain with the spectrum of the noise before, decision-directed."""
     spectra = spectra_of(sound)
     noise = (np.abs(spectra[1 : before // STEP]) ** 2).mean(axis=0) + 1e-12
-    ratio = np.abs(spectra) ** 2 / noise
-    kept = np.zeros(len(noise))
-    gains = np.empty_like(ratio)
-    for k, row in enumerate(ratio):
-        prior = np.maximum(SMOOTHING * kept + (1.0 - SMOOTHING) * np.maximum(row - 1.0, 0.0), FLOOR)
-        gains[k] = prior / (1.0 + prior)
-        kept = gains[k] ** 2 * row
+    gains, _ = decision_directed(np.abs(spectra) ** 2 / noise, np.zeros(len(noise)))
     return sound_of(spectra * gains, len(sound))
 
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from locagen_edge.files import write
 from locagen_edge.lab.denoise.bearings import wilson
-from locagen_edge.lab.denoise.evaluate import CLASS_SNRS_DB, HELP
+from locagen_edge.lab.denoise.evaluate import CLASS_SNRS_DB, HELP, WORSE_DB
 from locagen_edge.lab.denoise.peers import spectra_of
 from locagen_edge.lab.plots import draw
 from locagen_edge.stages.denoise import RATE_HZ
@@ -40,7 +40,7 @@ def markdown(result: dict[str, Any]) -> str:
         "",
         "## SI-SDRi in dB, and gain, by SNR",
         "",
-        *_table(result["by_snr"], lambda x: f"{x['improvement_db']:.1f} ({x['gain']:.2f})", " dB"),
+        *_table(result["by_snr"], lambda x: f"{_db(x)} ({x['gain']:.2f})", " dB"),
         "",
         "## NR by SNR",
         "",
@@ -63,11 +63,11 @@ def markdown(result: dict[str, Any]) -> str:
         "",
         f"## SI-SDRi in dB, and gain, by class (over {', '.join(f'{x:g}' for x in CLASS_SNRS_DB)} dB)",
         "",
-        *_table(result["by_class"], lambda x: f"{x['improvement_db']:.1f} ({x['gain']:.2f})", ""),
+        *_table(result["by_class"], lambda x: f"{_db(x)} ({x['gain']:.2f})", ""),
         "",
         "## SI-SDRi at 0 dB by drone",
         "",
-        *_table({n: result["by_drone"][n] for n in ours}, lambda x: f"{x['improvement_db']:.1f}", ""),
+        *_table({n: result["by_drone"][n] for n in ours}, lambda x: f"{_db(x)}", ""),
     ]  # fmt: skip
     for name in ours:
         data = result["by_class_and_snr"][name]
@@ -75,15 +75,20 @@ def markdown(result: dict[str, Any]) -> str:
             f"{kind} at {snr} dB"
             for kind, row in data.items()
             for snr, x in row.items()
-            if x["improvement_db"] < 0
+            if x["improvement_db"] < WORSE_DB
         ]
         lines += [
             "", f"## {name}: SI-SDRi in dB by class and SNR", "",
-            *_table(data, lambda x: f"{x['improvement_db']:.1f}", " dB"), "",
+            *_table(data, lambda x: f"{_db(x)}", " dB"), "",
             f"Worse than its input: {', '.join(worse) if worse else 'nowhere'}.",
         ]  # fmt: skip
     lines += ["", "![waveforms](waveforms.png)", "", "![spectra](spectra.png)", "", "![by SNR](by-snr.png)"]
     return "\n".join(lines) + "\n"
+
+
+def _db(x: dict[str, float]) -> str:
+    """Without the sign of what rounds to nothing."""
+    return f"{round(x['improvement_db'], 1) + 0.0:.1f}"
 
 
 def _table(data: dict[str, dict[str, Any]], cell: Any, unit: str) -> list[str]:

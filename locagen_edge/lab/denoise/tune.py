@@ -50,6 +50,7 @@ def tune(s: LabSettings, noise: Path, out: Path, each: int = EACH) -> dict[str, 
         "mask", s, out, Mixer(s, own, 11, pool, ALTER), Mixer(s, validation, 12, max(pool // 4, 4), ALTER),
         start=base,
     )  # fmt: skip
+    net.load_state_dict(halfway(base, net.state_dict()))
     seconds = sum(len(x) for x in tuned_on) / s.audio.rate_hz
     story = (
         f"- **Tuned** from {s.denoise.mask} on {seconds:.0f} s of one drone's noise; made for that drone.\n"
@@ -75,6 +76,14 @@ def tune(s: LabSettings, noise: Path, out: Path, each: int = EACH) -> dict[str, 
     )
     write(out / "flight.toml", sample(flight))
     return result
+
+
+def halfway(base: dict[str, Any], tuned: dict[str, Any]) -> dict[str, Any]:
+    """Weights between those before and after tuning: seconds of one drone are soon learnt by heart, and what
+    lies between two such networks is better on the noise of neither (Wortsman et al., "Robust fine-tuning of
+    zero-shot models", CVPR 2022).
+    """
+    return {name: (base[name] + value) / 2 for name, value in tuned.items()}
 
 
 def own_recordings(s: LabSettings, noise: Path) -> list[F32]:
