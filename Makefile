@@ -65,7 +65,7 @@ $(VENV)/.flight: $(KERNEL)
 test: $(VENV)/.dev csrc-test csrc-test-threads csrc-test-aarch64 ## sets up and runs all tests
 	$(call need,libasound2-dev,tests with a virtual sound card)
 	$(call need,pulseaudio pulseaudio-utils libasound2-plugins,tests with a sound server)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 .PHONY: check
 check: $(VENV)/.dev ## lint, format, types: what CI runs before the tests
@@ -111,7 +111,7 @@ csrc-test-aarch64: ## the same for aarch64 under qemu-user
 
 .PHONY: nightly
 nightly: $(VENV)/.dev csrc-test csrc-test-threads csrc-test-aarch64 ## the tests with many more and new examples, and on whole machines
-	LOCAGEN_NIGHTLY=1 $(BIN)/python -m pytest
+	LOCAGEN_NIGHTLY=1 $(BIN)/python -m pytest -n auto --dist loadfile
 	PYTHONPATH=. $(BIN)/python tests/mavlink/fuzz.py --inputs 10000000
 	$(MAKE) deb-test arm-test vm-test
 
@@ -147,6 +147,7 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(BIN)/python bench/bench_detection.py
 	$(BIN)/python bench/bench_twin.py
 	$(BIN)/python bench/bench_position.py
+	$(BIN)/python bench/tables.py
 
 .PHONY: models
 models: $(VENV)/.dev ## trains the models anew
