@@ -105,7 +105,7 @@ def test_a_sound_server_gives_every_row_once_and_in_order(sound_server, channels
         channel_map=channel_map,
         **UNTOUCHED,
     )
-    # the player's first rows come after silence, and others may where the machine is busy: that silence is the
+    # the player's first rows come after silence, and others may where the machine is busy: it is the
     # server's own; between it no row is missing
     whole, before = 0, None
     for frame in found["frames"]:
