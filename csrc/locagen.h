@@ -186,7 +186,8 @@ int locagen_steer_watch(locagen_steer *state, int32_t span);
  * settle, with this share of each search; by now a call that began then would be known as one. What is kept in mind
  * lessens T in each direction and part of the band to 1 / (E (q - 1)^2 * bins averaged), which is T itself where
  * the noise keeps still. So a score means the same under rotors that hum and under rotors that hunt: a constant
- * false-alarm rate. */
+ * false-alarm rate. Which direction is best, its information and its rival are told with nearly all looks of what
+ * stands far above anything that the noise has reached. */
 int locagen_steer_settle(locagen_steer *state, int32_t span, float share);
 
 /* Instead of watch, while something calls: what was put aside is dropped. */
