@@ -162,10 +162,12 @@ def steered(trial: Trial) -> Answer:
     """The likeliest direction, by the frame or by the second; nothing is taken for a call, all is learnt."""
     settings = settings_of(trial, "steered")
     locate = SteeredLocator(settings)
-    for frame in frames(trial):
+    *before, last = frames(trial)
+    for frame in before:
         locate(frame, NOTHING, settings.hop_s)
-        found = locate.likeliest(0 if trial.call == FRAME else 1)
         locate.settle(False)
+    locate(last, NOTHING, settings.hop_s)
+    found = locate.likeliest(0 if trial.call == FRAME else 1)
     return Answer(found.azimuth_rad, found.azimuth_sigma_rad)
 
 
@@ -206,6 +208,7 @@ def peer(name: str, trial: Trial) -> Answer:
     return Answer(float(method.azimuth_recon[0]))
 
 
+@functools.cache
 def judges() -> tuple[dict[str, Method], list[str]]:
     found: dict[str, Method] = {"steered": steered, "steered, told": partial(chain, "steered")}
     found |= {name: partial(chain, name) for name in ESTIMATORS}
@@ -255,8 +258,9 @@ def one(cell: str, names: tuple[str, ...], seed: int) -> tuple[float, dict[str, 
     make, arguments = CELLS[cell]
     trial = make(*arguments, np.random.default_rng([seed, len(cell)]))
     found = {}
+    methods, _ = judges()
     for name in judged(cell, names):
-        answer = judges()[0][name](trial)
+        answer = methods[name](trial)
         if answer.azimuth is None:
             found[name] = (math.nan, None)
             continue
