@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -44,3 +45,44 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def card(library: Path, tmp_path: Path) -> VirtualCard:
     return VirtualCard(library, tmp_path)
+
+
+SMALL = """
+[mixes]
+clip_s = 0.6
+before_s = 0.5
+pool = 8
+
+[wave]
+width = 8
+batch = 4
+steps = 6
+check = 3
+
+[mask]
+width = 8
+blocks = 1
+batch = 4
+steps = 6
+check = 3
+"""
+"""Settings of denoisers that are trained in a second."""
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("denoise") / "small.toml"
+    path.write_text(SMALL)
+    return path
+
+
+@pytest.fixture(scope="module")
+def few_sounds() -> Iterator[None]:
+    """Synthesised classes of ten utterances, without espeak-ng: other machines have none."""
+    from locagen_edge.lab.denoise import sounds
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sounds, "SYNTHESISED", 10)
+        patch.setattr(sounds, "ROTORS", 4)
+        patch.setattr(sounds.shutil, "which", lambda _: None)
+        yield

@@ -28,44 +28,9 @@ from locagen_edge.sim.levels import band_power, to_db
 from locagen_edge.sim.rotors import rotor
 from locagen_edge.stages.denoise import RATE_HZ
 
+pytestmark = pytest.mark.usefixtures("few_sounds")
 MOST_PARAMETERS = 100_000
-SMALL = """
-[mixes]
-clip_s = 0.6
-before_s = 0.5
-pool = 8
-
-[wave]
-width = 8
-batch = 4
-steps = 6
-check = 3
-
-[mask]
-width = 8
-blocks = 1
-batch = 4
-steps = 6
-check = 3
-"""
 NETS = {"wave": lambda: WaveNet(LabSettings().wave), "mask": lambda: MaskNet(LabSettings().mask)}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_sounds():
-    """Synthesised classes of ten utterances, without espeak-ng: other machines have none."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sounds, "SYNTHESISED", 10)
-        patch.setattr(sounds, "ROTORS", 4)
-        patch.setattr(sounds.shutil, "which", lambda _: None)
-        yield
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    path = tmp_path_factory.mktemp("denoise") / "small.toml"
-    path.write_text(SMALL)
-    return path
 
 
 # --- the measure --------------------------------------------------------------------------------------

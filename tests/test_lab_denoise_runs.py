@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 import soundfile
 import torch
-from test_lab_denoise import SMALL
+from conftest import SMALL
 
 from locagen_edge.lab.cli import main
-from locagen_edge.lab.denoise import bearings, evaluate, sounds
+from locagen_edge.lab.denoise import bearings, evaluate
 from locagen_edge.lab.denoise.callers import CALLERS
 from locagen_edge.lab.denoise.publish import weights_of
 from locagen_edge.lab.settings import read
 from locagen_edge.settings import load
 from locagen_edge.stages.denoise import MaskDenoiser
 
+pytestmark = pytest.mark.usefixtures("few_sounds")
 KINDS = ("wave", "mask")
 
 
@@ -25,23 +26,6 @@ def lab(*arguments: object) -> int:
     with pytest.raises(SystemExit) as ended:
         main([str(argument) for argument in arguments])
     return int(ended.value.code or 0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_sounds():
-    """Synthesised classes of ten utterances, without espeak-ng: other machines have none."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sounds, "SYNTHESISED", 10)
-        patch.setattr(sounds, "ROTORS", 4)
-        patch.setattr(sounds.shutil, "which", lambda _: None)
-        yield
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    path = tmp_path_factory.mktemp("denoise") / "small.toml"
-    path.write_text(SMALL)
-    return path
 
 
 @pytest.fixture(scope="module")
