@@ -14,14 +14,16 @@ from locagen_edge.geometry import tolerance_rad
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing import make_locator
 from locagen_edge.stages.bearing.common import Locator
+from locagen_edge.stages.bearing.steered import SteeredLocator
 from locagen_edge.stages.correlation import Correlator
 from locagen_edge.stages.denoise import MASKERS, Masker, WaveDenoiser
 from locagen_edge.stages.detection import Detector
 from locagen_edge.stages.faults import FaultFinder
 from locagen_edge.stages.position import Positioner, sighting
+from locagen_edge.stages.repeats import Repeats
 from locagen_edge.stages.tdoa import PeakPicker
 from locagen_edge.stages.track import Tracker
-from locagen_edge.types import Estimate, Frame, Pose, Sighting, Track
+from locagen_edge.types import Bearing, Estimate, Frame, Pose, Quaternion, Sighting, Track
 
 
 class Pipeline:
@@ -38,6 +40,7 @@ class Pipeline:
         self._denoise, self._mask = _made_denoiser(settings)
         self._correlate, self._pick, self._locate = _made_for_array(settings)
         self._detect = Detector(settings.detection)
+        self._repeats = Repeats(settings)
         self._find_faults = FaultFinder(settings)
         self._tolerance_rad = tolerance_rad(array, settings.array.tolerance_m)
         self._positioner = Positioner(settings.position)
@@ -70,16 +73,19 @@ class Pipeline:
             denoiser = _made_denoiser(settings)
         if _for_array(settings) != _for_array(self._settings):
             self._correlate, self._pick, self._locate = _made_for_array(settings)
+            self._repeats.forget()
             self._find_faults.apply(settings)
         self._denoise, self._mask = denoiser
         self._settings = settings
         self._locate.apply(settings)
         self._detect.apply(settings.detection)
+        self._repeats.apply(settings)
         self._track.apply(settings.track, settings.pose, settings.mic_array.normal)
 
     def forget_noise(self) -> None:
         """Learns background and noise from nothing: call it between two frames."""
         self._locate.forget()
+        self._repeats.forget()
         self._denoise, self._mask = _made_denoiser(self._settings)
         self._detect.forget()
 
@@ -105,7 +111,12 @@ class Pipeline:
         self._locate.settle(detection.call)
         if self._mask is not None:
             self._mask.settle(detection.call)
-        tracks = self._track(bearings, detection, elapsed_s, pose.attitude if pose else None)
+        attitude = pose.attitude if pose else None
+        again = self._again(bearings[0], elapsed_s, attitude)
+        # what is learnt as noise does not hang on it: a caller who is remembered wrongly stays noise
+        if again is not None and not detection.call:
+            bearings, detection = (again,), replace(detection, call=True, since_s=self._hop_s)
+        tracks = self._track(bearings, detection, elapsed_s, attitude)
         sightings = tuple(self._looks(tracks, pose))
         positions = (self._positioner.position(t.id, frame.middle_ns) for t in tracks if t.confirmed)
         return Estimate(
@@ -123,6 +134,13 @@ class Pipeline:
             positions=tuple(position for position in positions if position is not None),
             sightings=sightings,
         )
+
+    def _again(self, bearing: Bearing, elapsed_s: float, attitude: Quaternion | None) -> Bearing | None:
+        """Of somebody who has called before, by what this frame alone scores."""
+        if not isinstance(self._locate, SteeredLocator):
+            return None
+        _, scores = self._locate.scores(replace(bearing, span_s=0.0))
+        return self._repeats(scores, bearing.evidence, elapsed_s, attitude)
 
     def _looks(self, tracks: tuple[Track, ...], pose: Pose | None) -> Iterator[Sighting]:
         """This frame's own bearings of callers, those that went into their positions."""

@@ -324,6 +324,15 @@ class DetectionSettings:
         "that hunt.",
         unit="times", least=1, most=1000,
     )  # fmt: skip
+    repeats_s: float = setting(
+        40.0,
+        "Estimator `steered`: for how long what is too faint for a call is remembered, so that somebody who "
+        "calls again and again from one direction is found (and somebody who was found once, sooner). 0: not "
+        "at all.",
+        unit="s",
+        least=0,
+        most=600,
+    )
     snr_db: float = setting(
         0.0, "Other estimators: in-band level over the tracked background from which a frame is a call.",
         unit="dB", least=-20, most=60,

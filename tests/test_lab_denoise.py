@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from locagen_edge.errors import DatasetError, ModelError
 from locagen_edge.geometry import direction
-from locagen_edge.lab.denoise import bearings, evaluate, sounds
+from locagen_edge.lab.denoise import bearings, evaluate, repeats, sounds
 from locagen_edge.lab.denoise.callers import CALLERS
 from locagen_edge.lab.denoise.cases import Case, cases, with_array
 from locagen_edge.lab.denoise.mixes import Mixer, length
@@ -278,6 +278,30 @@ def test_sound_for_bearings_has_its_snr_and_its_direction(small) -> None:
         assert to_db(powers[0]) == pytest.approx(to_db(powers[1])) == pytest.approx(bearings.LEVEL_DBFS)
     p = s.mic_array.positions_m
     assert_delays(call[:, -n:], np.array([(p[i] - p[j]) @ u for i, j in s.mic_array.pairs]) / s.speed_m_s, s)
+
+
+def test_a_caller_calls_five_times_from_one_place_as_loud_each_time(small) -> None:
+    s = read(small)
+    (caller,) = repeats.callers(s, 1)
+    noise, calls = repeats.sound_of(s, caller, "near rotors")
+    rate_hz = s.audio.rate_hz
+    assert noise.shape == calls.shape == (s.mic_array.mics, 70 * rate_hz)
+    ends = [start + len(call) for start, call in zip(caller.starts, caller.calls, strict=True)]
+    assert caller.starts[0] >= bearings.BEFORE_S * rate_hz
+    assert caller.end == ends[-1] <= 70 * rate_hz
+    gaps = [later - end for later, end in zip(caller.starts[1:], ends[:-1], strict=True)]
+    assert len(gaps) == 4
+    assert min(gaps) >= repeats.PAUSE_S * rate_hz
+    u = direction(caller.event.azimuth_rad, bearings.ELEVATION_RAD)
+    p = s.mic_array.positions_m
+    delays_s = np.array([(p[i] - p[j]) @ u for i, j in s.mic_array.pairs]) / s.speed_m_s
+    assert to_db(band_power(noise, rate_hz)) == pytest.approx(bearings.LEVEL_DBFS)
+    for start, end in zip(caller.starts, ends, strict=True):
+        one = calls[:, start:end]
+        assert to_db(band_power(one, rate_hz)) == pytest.approx(bearings.LEVEL_DBFS)
+        assert_delays(one, delays_s, s)
+        calls[:, start:end] = 0.0
+    assert not calls.any()
 
 
 def test_the_confidence_interval_is_wilsons() -> None:

@@ -11,7 +11,7 @@ import torch
 from conftest import SMALL
 
 from locagen_edge.lab.cli import main
-from locagen_edge.lab.denoise import bearings, evaluate
+from locagen_edge.lab.denoise import bearings, evaluate, repeats
 from locagen_edge.lab.denoise.callers import CALLERS
 from locagen_edge.lab.denoise.publish import weights_of
 from locagen_edge.lab.settings import read
@@ -86,19 +86,31 @@ def test_the_evaluation_tells_all(runs, small, tmp_path, monkeypatch) -> None:
     assert all(f"({name})" in text for name in names if name.endswith(".png"))
 
 
-def test_the_bearings_are_told(small, tmp_path, monkeypatch) -> None:
+def test_the_bearings_are_told(small, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(bearings, "BEFORE_S", 2.0)
     monkeypatch.setattr(bearings, "SNRS_DB", (30.0,))
+    monkeypatch.setattr(repeats, "SNRS_DB", (30.0,))
+    monkeypatch.setattr(repeats, "MINUTE_S", 20.0)
     out = tmp_path / "report"
-    assert lab("denoise", "evaluate", "--settings", small, "--bearings", 1, "--out", out) == 0
+    words = ("--settings", small, "--out", out, "--repeated", 1)
+    assert lab("denoise", "evaluate", *words) == 1
+    assert "goes with --bearings" in capsys.readouterr().err
+    assert lab("denoise", "evaluate", *words, "--bearings", 1) == 0
     assert {path.name for path in out.iterdir()} == {"bearings.md", "bearings.json", "bearings.png"}
-    fields = json.loads((out / "bearings.json").read_text())["fields"]
+    result = json.loads((out / "bearings.json").read_text())
+    fields = result["fields"]
     assert set(fields) == set(bearings.FIELDS)
     assert all(
         set(table) == set(bearings.METHODS) for lengths in fields.values() for table in lengths.values()
     )
     # no drone is as loud as this call, and PHAT needs no noise before
     assert all(lengths["1"]["PHAT"]["30"]["right"] == 1.0 for lengths in fields.values())
+    assert all(
+        table[method]["30"]["right"] == 1.0
+        for lengths in result["repeated"]["fields"].values()
+        for table in lengths.values()
+        for method in repeats.METHODS
+    )
     assert "nan" not in (out / "bearings.md").read_text()
 
 

@@ -10,12 +10,12 @@ of the whole one.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from tqdm import tqdm
@@ -51,6 +51,9 @@ METHODS: dict[str, tuple[str, str, float]] = {
 }
 """denoise.kind, bearing.estimator and correlation.relative_floor_db: at -1 dB bins below the mean fade out
 nearly as without whitening"""
+
+
+Job = TypeVar("Job")
 
 
 @dataclass(frozen=True)
@@ -92,13 +95,19 @@ def events(s: LabSettings, count: int) -> Iterator[Event]:
         rng = np.random.default_rng([s.mixes.seed, 77, k])
         kind, drone = sorted(calls)[k % len(calls)], list(drones)[k % len(drones)]
         call = calls[kind][rng.integers(len(calls[kind]))].astype(np.float64)
-        noise = drones[drone][rng.integers(len(drones[drone]))].astype(np.float64)
         # what is shorter is heard again and again
         whole = loudest(np.tile(call, math.ceil(n / len(call))), n)
-        while len(noise) < m:
-            noise = np.concatenate([noise, noise[::-1]])
-        first = rng.integers(len(noise) - m + 1)
-        yield Event(kind, drone, whole, noise[first : first + m], float(rng.uniform(-math.pi, math.pi)), k)
+        noise = stretch(drones[drone], m, rng)
+        yield Event(kind, drone, whole, noise, float(rng.uniform(-math.pi, math.pi)), k)
+
+
+def stretch(sounds: list[F32], m: int, rng: np.random.Generator) -> F64:
+    """m samples of one of a drone's recordings, from anywhere; a shorter one goes to and fro."""
+    noise = sounds[rng.integers(len(sounds))].astype(np.float64)
+    while len(noise) < m:
+        noise = np.concatenate([noise, noise[::-1]])
+    first = rng.integers(len(noise) - m + 1)
+    return noise[first : first + m]
 
 
 def _heard_s() -> float:
@@ -229,13 +238,16 @@ def evaluate(
     chosen = list(events(s, count))
     jobs = [(event, field) for event in chosen for field in fields]
     ask = partial(answers, s, methods, SNRS_DB if snrs_db is None else snrs_db)
-    bar = partial(tqdm, total=len(jobs), unit="scene", desc="bearings")
+    return summary(chosen, asked(ask, jobs, processes, "bearings"))
+
+
+def asked(ask: Callable[[Job], list[Answer]], jobs: list[Job], processes: int, name: str) -> list[Answer]:
+    """All answers to all jobs, with a progress bar of that name."""
+    bar = partial(tqdm, total=len(jobs), unit="scene", desc=name)
     if processes > 1:
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-            said = [one for some in bar(pool.map(ask, jobs)) for one in some]
-    else:
-        said = [one for some in bar(map(ask, jobs)) for one in some]
-    return summary(chosen, said)
+            return [one for some in bar(pool.map(ask, jobs)) for one in some]
+    return [one for some in bar(map(ask, jobs)) for one in some]
 
 
 def summary(chosen: list[Event], said: list[Answer]) -> dict[str, Any]:

@@ -78,6 +78,13 @@ def add_command(subparsers: Any, common: argparse.ArgumentParser) -> None:
         help="instead: the share of so many calls whose direction the whole pipeline finds with each; writes "
         "bearings.md, bearings.json and a figure (60: an hour of one core)",
     )
+    evaluate.add_argument(
+        "--repeated",
+        type=int,
+        metavar="CALLERS",
+        help="with --bearings, besides: the share of so many callers, each of whom calls five times in a "
+        "minute, whose direction is told at the end (20: a quarter of an hour of one core)",
+    )
     evaluate.add_argument("--processes", type=int, default=1, help="processes for --bearings (default 1)")
     evaluate.set_defaults(command=_evaluate)
 
@@ -144,6 +151,8 @@ def _same_run(s: LabSettings, out: Path) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     s = _settings(arguments, arguments.noise)
+    if arguments.bearings is None and arguments.repeated is not None:
+        raise DatasetError("--repeated: goes with --bearings EVENTS")
     if arguments.bearings is not None:
         return _bearings(arguments, s)
 
@@ -170,9 +179,12 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def _bearings(arguments: argparse.Namespace, s: LabSettings) -> int:
-    from locagen_edge.lab.denoise import bearings, report
+    from locagen_edge.lab.denoise import bearings, repeats, report
 
-    result = bearings.evaluate(s, max(arguments.bearings, 1), max(arguments.processes, 1))
+    processes = max(arguments.processes, 1)
+    result = bearings.evaluate(s, max(arguments.bearings, 1), processes)
+    if arguments.repeated is not None:
+        result["repeated"] = repeats.evaluate(s, max(arguments.repeated, 1), processes)
     report.save_bearings(result, arguments.out)
     print(f"wrote {arguments.out / 'bearings.md'}")
     return 0

@@ -121,7 +121,27 @@ def bearings_markdown(result: dict[str, Any]) -> str:
             lines += _table(table, lambda x: f"{x['right']:.0%} ({x['called']:.0%})", " dB")
     lines += ["", "## All fields and lengths together", ""]
     lines += _table(_together(result), lambda x: f"{x['right']:.0%} ({x['called']:.0%})", " dB")
-    return "\n".join([*lines, "", "![bearings](bearings.png)"]) + "\n"
+    lines += ["", "![bearings](bearings.png)"]
+    if "repeated" in result:
+        lines += ["", *_repeated(result["repeated"])]
+    return "\n".join(lines) + "\n"
+
+
+def _repeated(result: dict[str, Any]) -> list[str]:
+    """The tables of `repeats.evaluate`."""
+    lines = [
+        "# One caller, five calls in a minute",
+        "",
+        f"{result['events']} callers, each of whom calls five times (2.25 s) in a minute. Share whose "
+        "direction is told within 10 degrees at the end of the last call; in brackets the share for which "
+        "any is told. "
+        f"Known to +-{_widest(result):.0%} or better (95 % confidence).",
+    ]
+    for field, lengths in result["fields"].items():
+        for table in lengths.values():
+            lines += ["", f"## {field}", ""]
+            lines += _table(table, lambda x: f"{x['right']:.0%} ({x['called']:.0%})", " dB")
+    return lines
 
 
 def _widest(result: dict[str, Any]) -> float:
