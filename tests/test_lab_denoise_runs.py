@@ -127,6 +127,16 @@ def test_own_drone(runs, small, tmp_path, capsys) -> None:
     flight = load(tmp_path / "own" / "flight.toml")
     assert (flight.denoise.kind, flight.denoise.mask) == ("mask", "denoise-mask-own")
     MaskDenoiser(flight)
-    for noise, says in (("none.wav", "neither a recording nor a folder"), ("s.toml", "cannot be read")):
+    soundfile.write(tmp_path / "other.wav", 0.1 * rng.standard_normal(80_000), 16_000)
+    soundfile.write(tmp_path / "muted.wav", np.zeros(80_000), 16_000)
+    (tmp_path / "empty").mkdir()
+    refused = {
+        "none.wav": "neither a recording nor a folder",
+        "s.toml": "cannot be read",
+        "other.wav": "is tuned to other recordings",
+        "muted.wav": "nothing but silence",
+        "empty": "holds no .wav",
+    }
+    for noise, says in refused.items():
         assert lab("denoise", "tune", tmp_path / noise, *words) == 1
         assert says in capsys.readouterr().err

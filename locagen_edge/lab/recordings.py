@@ -24,14 +24,14 @@ def load(folder: str, rate_hz: int) -> tuple[tuple[str, F32], ...]:
     """
     files = sorted(p for p in Path(folder).rglob("*") if p.suffix.lower() in ENDINGS)
     if not files:
-        raise DatasetError(f"scene.recordings: no {', '.join(ENDINGS)} file in {folder}")
+        raise DatasetError(f"{folder}: holds no {', '.join(ENDINGS)} file")
     sounds = []
     for file in files:
         mono = read_sound(file, rate_hz)
         if mono.any():  # a file of zeros cannot call
             sounds.append((file.relative_to(folder).as_posix(), mono))
     if not sounds:
-        raise DatasetError(f"scene.recordings: nothing but silence in {folder}")
+        raise DatasetError(f"{folder}: holds nothing but silence")
     return tuple(sounds)
 
 

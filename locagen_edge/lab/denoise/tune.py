@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -35,16 +36,17 @@ EACH = 3
 def tune(s: LabSettings, noise: Path, out: Path, each: int = EACH) -> dict[str, Any]:
     """Tunes `denoise.mask` on the recordings and installs the result in out/models with out/flight.toml.
 
-    Returns the report's numbers. Raises `DatasetError` where there is too little noise.
+    Returns the report's numbers. Raises `DatasetError` where there is too little noise, or another drone's
+    tuning in `out`.
     """
     sounds = own_recordings(s, noise)
     tuned_on, held = own_parts(s, sounds)
+    _same_drone(out, sounds)
     base = weights_of(s.denoise.mask, directory_of(s))
     shape = base["enter.weight"].shape[0]
     s = dataclasses.replace(s, mask=dataclasses.replace(s.mask, width=shape, blocks=_blocks(base)))
     own = Corpus(corpus_of_calls(s, "train"), {str(k): sound for k, sound in enumerate(tuned_on)}, [])
     validation = Corpus(corpus_of_calls(s, "validate"), own.drones, [])
-    out.mkdir(parents=True, exist_ok=True)
     pool = s.mixes.pool
     net = fit(
         "mask", s, out, Mixer(s, own, 11, pool, ALTER), Mixer(s, validation, 12, max(pool // 4, 4), ALTER),
@@ -92,7 +94,20 @@ def own_recordings(s: LabSettings, noise: Path) -> list[F32]:
         return [high_passed(s, sound) for _, sound in load(str(noise), s.audio.rate_hz)]
     if not noise.is_file():
         raise DatasetError(f"{noise}: is neither a recording nor a folder of them")
-    return [high_passed(s, read_sound(noise, s.audio.rate_hz))]
+    sound = read_sound(noise, s.audio.rate_hz)
+    if not sound.any():
+        raise DatasetError(f"{noise}: nothing but silence; was the microphone muted?")
+    return [high_passed(s, sound)]
+
+
+def _same_drone(out: Path, sounds: list[F32]) -> None:
+    """A run that was cut off is gone on with, but never with the sound of another drone."""
+    digest = hashlib.sha256(b"".join(sound.tobytes() for sound in sounds)).hexdigest()
+    kept = out / "noise.sha256"
+    if (out / "checkpoint.pt").exists() and (not kept.exists() or kept.read_text().strip() != digest):
+        raise DatasetError(f"{out}: is tuned to other recordings; choose another --out")
+    out.mkdir(parents=True, exist_ok=True)
+    write(kept, digest + "\n")
 
 
 def corpus_of_calls(s: LabSettings, part: str) -> dict[str, list[F32]]:
@@ -138,8 +153,9 @@ def markdown(result: dict[str, Any]) -> str:
 def line(result: dict[str, Any]) -> str:
     """The same in one line."""
     before, after = (result["by_snr"][name]["0"] for name in ("as it came", "tuned"))
+    worth = "" if after["nr"] > before["nr"] else "; it brought nothing: fly the mask as it came"
     return (
         f"noise removed at 0 dB, on the {result['held_back_s']:.0f} s held back: {before['nr']:.0%} as it "
         f"came, "
-        f"{after['nr']:.0%} tuned; gain on the call {before['gain']:.2f}, {after['gain']:.2f}"
+        f"{after['nr']:.0%} tuned; gain on the call {before['gain']:.2f}, {after['gain']:.2f}{worth}"
     )
