@@ -2,9 +2,9 @@
 
 Linear phase (a windowed sinc; Oppenheim & Schafer, *Discrete-Time Signal Processing*, section 7.5: Kaiser),
 so a sample waits for half of the filter, 4.8 ms from 48 kHz to 10 kHz, and no longer: resamplers of libraries
-work in blocks (soxr's hold sound back for 12 to 75 ms, and let frames come in twos). Nothing is shifted: output
-sample k belongs to time k / rate_out, so time needs no correction. All microphones share one filter and one
-phase, so no delay between them is made up.
+work in blocks (soxr's hold sound back for 12 to 75 ms, and let frames come in twos). Nothing is shifted:
+output sample k belongs to time k / rate_out, so time needs no correction. All microphones share one filter
+and one phase, so no delay between them is made up.
 
 Up to 0.94 of the lower rate's Nyquist frequency sound passes, within 0.003 %; what is folded in from beyond
 lies above that, and above any band that is listened to by default.
