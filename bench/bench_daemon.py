@@ -65,7 +65,7 @@ GOALS: dict[str, dict[str, float]] = {
 }
 DELAY_GOAL_MS = {"median": 2.0, "p99": 5.0}
 RATE_HZ = 48_000
-QUIET_S = {"paper": 0.3, "steered": 1.6, "mask": 1.6}
+QUIET_S = {"paper": 0.3, "steered": 0.85, "mask": 0.85}
 """Noise before the first call: the steered estimator has to have heard the rotors before it hears anybody."""
 WINDOW_S = 5.0
 """CPU is told of the least busy and the middling one of such windows: a machine has other things to do."""

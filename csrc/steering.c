@@ -400,17 +400,18 @@ static void add(const steer *s, int slot, float share, float *matrix, float *los
     weights[0] = fresh;
 }
 
-int locagen_steer_learn(locagen_steer *memory, float share)
+int locagen_steer_learn(locagen_steer *memory, int32_t ago, float share)
 {
     if (memory == NULL)
         return LOCAGEN_E_NULL;
     if (!within(share, 0, 1))
         return LOCAGEN_E_SHARE;
     steer *s = state_of(memory);
-    if (s->listened <= s->lag)
+    if (ago < 0 || ago > s->lag)
+        return LOCAGEN_E_LAG;
+    if (s->listened <= ago)
         return LOCAGEN_OK;
-    int oldest = (s->slot + 1) % (s->lag + 1);
-    add(s, oldest, share, s->noise, s->lost_noise, &s->learnt, &s->learnt_variance, s->learnt_weights);
+    add(s, (s->slot + s->lag + 1 - ago) % (s->lag + 1), share, s->noise, s->lost_noise, &s->learnt, &s->learnt_variance, s->learnt_weights);
     s->inverse_mics = 0;
     return LOCAGEN_OK;
 }

@@ -419,7 +419,7 @@ static void learn_hiss(const steer_bench *b, int frames)
         be_silent(b);
         add_hiss(b, 0.1f);
         CHECK(locagen_steer_listen(b->kernel, b->in, b->power) == 0, "hiss is finite");
-        CHECK(locagen_steer_learn(b->kernel, 1.0f / (float)(n + 1)) == 0, "learnt");
+        CHECK(locagen_steer_learn(b->kernel, 0, 1.0f / (float)(n + 1)) == 0, "learnt");
     }
 }
 
@@ -529,7 +529,7 @@ static void test_steered_faults(const locagen_steer_paths *chosen)
                 int bad = locagen_steer_listen(b.kernel, b.in, b.power);
                 CHECK(bad == (faults[fault] == 0.0f ? 0 : 1 << faulty), "%d mics, fault %zu: %d", mics, fault, bad);
                 CHECK(b.power[faulty] == 0.0f, "power %g", (double)b.power[faulty]);
-                frame < 3 ? locagen_steer_learn(b.kernel, 0.5f) : locagen_steer_hear(b.kernel, 0, 0.5f);
+                frame < 3 ? locagen_steer_learn(b.kernel, 0, 0.5f) : locagen_steer_hear(b.kernel, 0, 0.5f);
             }
             int found = locagen_steer_search(b.kernel, 0, 8, 0, b.sources);
             CHECK(found < mics && (found > 0) == (mics > 2), "%d mics, fault %zu: %d found", mics, fault, found);
@@ -541,7 +541,7 @@ static void test_steered_faults(const locagen_steer_paths *chosen)
         }
 }
 
-/* What is learnt is the frame `lag` hops ago, of the ring's every turn; the largest lag of all in bounds. */
+/* What is learnt is the frame so many hops ago, of the ring's every turn; the largest lag of all in bounds. */
 static void test_steered_lag(const locagen_steer_paths *chosen)
 {
     for (int lag = 0; lag <= MOST_LAG; lag += 1 + lag) {
@@ -552,17 +552,22 @@ static void test_steered_lag(const locagen_steer_paths *chosen)
         float *noise = malloc(sizeof(float) * (size_t)(2 * b.bins * config.mics * config.mics));
         float *powers = malloc(sizeof(float) * (size_t)(3 * lag + 3));
         CHECK(now && noise && powers, "memory");
+        float expected = 0.0f;
         for (int n = 0; n < 3 * lag + 3; n++) {
             be_silent(&b);
             add_hiss(&b, 0.1f);
             locagen_steer_listen(b.kernel, b.in, b.power);
             locagen_steer_bins(b.kernel, now);
             powers[n] = now[0] * now[0] + now[1] * now[1];
-            CHECK(locagen_steer_learn(b.kernel, 1.0f) == 0, "learnt");
-            locagen_steer_noise(b.kernel, noise);
-            float expected = n < lag ? 0.0f : powers[n - lag];
-            CHECK(fabsf(noise[0] - expected) <= 1e-5f * expected, "lag %d, frame %d", lag, n);
+            for (int ago = lag; ago >= 0; ago -= 1 + ago / 2) {
+                CHECK(locagen_steer_learn(b.kernel, ago, 1.0f) == 0, "learnt");
+                locagen_steer_noise(b.kernel, noise);
+                expected = ago <= n ? powers[n - ago] : expected; /* nothing where so many have not been */
+                CHECK(fabsf(noise[0] - expected) <= 1e-5f * expected, "%d ago of %d, frame %d", ago, lag, n);
+            }
         }
+        CHECK(locagen_steer_learn(b.kernel, lag + 1, 1.0f) == LOCAGEN_E_LAG, "older than the ring");
+        CHECK(locagen_steer_learn(b.kernel, -1, 1.0f) == LOCAGEN_E_LAG, "yet to come");
         free(now), free(noise), free(powers);
         steer_tear_down(&b);
     }
@@ -626,7 +631,7 @@ static void test_steered_silence(const locagen_steer_paths *chosen)
         for (int n = 0; n < 60 * 7; n++)
             wrong += b.map[n] != 0.0f;
         CHECK(wrong == 0, "%d scores are not zero", wrong);
-        locagen_steer_learn(b.kernel, 0.5f);
+        locagen_steer_learn(b.kernel, 0, 0.5f);
     }
     add_wave(&b, 1.0, -0.6, 0.1f);
     locagen_steer_listen(b.kernel, b.in, b.power);
@@ -715,9 +720,9 @@ static void test_steered_refusals(void)
     CHECK(locagen_steer_listen(NULL, b.in, b.power) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_listen(b.kernel, NULL, b.power) == LOCAGEN_E_NULL, "no input");
     CHECK(locagen_steer_listen(b.kernel, b.in, NULL) == LOCAGEN_E_NULL, "no power");
-    CHECK(locagen_steer_learn(NULL, 0.5f) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_learn(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_hear(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
-    CHECK(locagen_steer_learn(b.kernel, NAN) == LOCAGEN_E_SHARE, "no share");
+    CHECK(locagen_steer_learn(b.kernel, 0, NAN) == LOCAGEN_E_SHARE, "no share");
     CHECK(locagen_steer_hear(b.kernel, 0, 1.5f) == LOCAGEN_E_SHARE, "too large a share");
     CHECK(locagen_steer_search(NULL, 0, 1, 0, b.sources) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_search(b.kernel, 0, 1, 0, NULL) == LOCAGEN_E_NULL, "no output");

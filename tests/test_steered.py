@@ -739,7 +739,7 @@ def test_learning_lags_and_spans_keep_apart(lag: int) -> None:
     frames = [hiss(rng) for _ in range(lag + 5)]
     for samples in frames:
         listen(found, samples)
-        found.learn(0.5)
+        found.learn(0.5, lag)
         found.hear(1.0, span=0)
         found.hear(0.25, span=1)
     for samples in frames[:5]:

@@ -33,7 +33,8 @@ LOOKS = 5
 learnt from fewer is nearly singular, and whitening by it invents sources."""
 
 LAG_S = 0.5
-"""Noise is learnt so late: by then a call is known as one, and its beginning is not learnt."""
+"""Noise is learnt so late: by then a call is known as one, and its beginning is not learnt. At the start it is
+learnt at once, for before the first bearing nothing can be known as a call."""
 MEANING = 1.3
 """Evidence from which a direction means something, though not yet a call."""
 WATCH_S = 15.0
@@ -108,6 +109,7 @@ class SteeredLocator:
         self._strange = [False for _ in self._spans_s]
         self._strange_hops = 0
         self._loud_hops_ago: int | None = None
+        self._to_judge = 0  # the last frames, of which nobody knows yet whether they are noise
         self._failing: deque[bool] = deque(maxlen=self._lag + 1)
         self._silent: deque[bool] = deque(maxlen=self._lag + 1)
         self._quiet_hops = 0
@@ -282,19 +284,29 @@ class SteeredLocator:
             # rotors have started: every frame in the ring is of now
             if self._strange_hops > self._lag or self._busy_s > LONGEST_S:
                 self._begin_anew()
+        self._to_judge = min(self._to_judge + 1, self._lag + 1)
+        while self._to_judge > (self._lag if self._to_learn <= 0 else 0):
+            self._to_judge -= 1
+            self._learn(self._to_judge)
+
+    def _learn(self, ago: int) -> None:
+        """The frame of so many hops ago."""
         patient = self._to_learn <= 0 and self._bad_hops <= self._patience
-        if len(self._failing) > self._lag and not (self._silent[0] or (patient and self._failing[0])):
-            surest = max(self._since_lag) if self._to_learn <= 0 else 0.0
-            caution = min(1.0, (self._least_ratio / max(surest, 1e-9)) ** 2)
-            share = max(1.0 - math.exp(-self._elapsed_s / self._forget_s), 1.0 / (self._learnt_frames + 1))
-            self._search.learn(caution * share)
-            self._learnt_frames += 1
-            self._to_learn = max(self._to_learn - 1, 0)
+        if self._silent[-1 - ago] or (patient and self._failing[-1 - ago]):
+            return
+        surest = max(self._since_lag) if self._to_learn <= 0 else 0.0
+        caution = min(1.0, (self._least_ratio / max(surest, 1e-9)) ** 2)
+        share = max(1.0 - math.exp(-self._elapsed_s / self._forget_s), 1.0 / (self._learnt_frames + 1))
+        self._search.learn(caution * share, ago)
+        self._learnt_frames += 1
+        self._to_learn = max(self._to_learn - 1, 0)
 
     def _watch(self, call: bool) -> None:
         """What the noise's scores are, put aside until it is sure that they are the noise's."""
         self._since_lag.append(max(self._ratios))
         self._quiet_hops = 0 if call else self._quiet_hops + 1
+        if self._to_judge < self._lag:
+            return  # just learnt from a few frames, and no more since: the noise is as unknown as it was
         quiet = self._quiet_hops * self._hop_s > PAUSE_S  # a call fades out, and its pauses are no noise
         for span in range(len(self._spans_s)):
             if not quiet:
