@@ -174,9 +174,12 @@ int locagen_steer_hear(locagen_steer *state, int32_t span, float share);
  * is looked for, and at last the directions of those that are clearly more than noise are refined, each with
  * the others nulled. Returns how many `out` holds: none before hear, in silence or with less than two
  * microphones; at most one less than there are microphones; none that scores `least` or less, and where
- * nothing does on the grid nothing is refined, which saves half of the time. A state that never learnt takes the noise for
- * white, and its level from what R_x holds across its best direction (M - 1 of M dimensions). */
-int locagen_steer_search(locagen_steer *state, int32_t span, int32_t most, float least, locagen_source *out);
+ * nothing does on the grid nothing is refined, which saves half of the time. With `further` above 0 a further
+ * source has to score more than that, and more than what a null may leave of the first. A state that never learnt
+ * takes the noise for white, and its level from what R_x holds across its best direction (M - 1 of M
+ * dimensions). */
+int locagen_steer_search(locagen_steer *state, int32_t span, int32_t most, float least, float further,
+                         locagen_source *out);
 
 /* Puts aside how far q strayed from 1 in the last search, in each direction of the grid and each part of the
  * band; while nothing calls. */

@@ -72,7 +72,7 @@ static size_t heard(int number, float *out)
         for (int s = 0; s < steer.spans; s++)
             locagen_steer_hear(search, s, n < 9 ? 0.5f : 1.0f);
     }
-    int found = locagen_steer_search(search, 0, 2, 0.0f, sources);
+    int found = locagen_steer_search(search, 0, 2, 0.0f, 0.0f, sources);
     out[count++] = (float)found;
     memcpy(out + count, sources, sizeof sources);
     count += sizeof sources / (sizeof(float));

@@ -316,15 +316,18 @@ class Steered:
         """Weights 0 to 1 of all bins in the band, float32, shape `(bins,)`, for the searches to come."""
         _check(lib.locagen_steer_weigh(self._state, _pointer(weight, (len(self.frequency_hz),))))
 
-    def search(self, max_sources: int = 1, span: int = 0, least: float = 0.0) -> tuple[Source, ...]:
+    def search(
+        self, max_sources: int = 1, span: int = 0, least: float = 0.0, further: float = 0.0
+    ) -> tuple[Source, ...]:
         """The sources in the span's matrix, strongest first; at most one less than there are microphones.
 
-        None before `hear`, in silence and with less than two microphones; none that scores `least` or less.
+        None before `hear`, in silence and with less than two microphones; none that scores `least` or less, and
+        beside the first none that scores `further` or less.
         Where nothing was learnt the noise is taken for white, and its level from what is across the best
         direction.
         """
         room = min(max_sources, _MOST_MICS)
-        found = _check(lib.locagen_steer_search(self._state, span, room, least, self._sources))
+        found = _check(lib.locagen_steer_search(self._state, span, room, least, further, self._sources))
         return tuple(
             Source(s.azimuth_rad, s.elevation_rad, s.score, s.contrast, s.rival, s.snr, tuple(s.information))
             for s in self._sources[0:found]

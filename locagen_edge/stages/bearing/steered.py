@@ -16,12 +16,12 @@ from collections import deque
 
 import numpy as np
 
-from locagen_edge.geometry import direction, tolerance_rad
+from locagen_edge.geometry import tolerance_rad
 from locagen_edge.kernel import Source, Steered
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import LARGEST_AZIMUTH_SIGMA_RAD, NOWHERE_RAD, no_bearing
 from locagen_edge.stages.bearing.evidence import Onsets, Usual
-from locagen_edge.types import F32, F64, Bearing, Evidence, Frame, Mask, Tdoa
+from locagen_edge.types import F32, Bearing, Evidence, Frame, Mask, Tdoa
 
 NAME = "steered"
 
@@ -81,15 +81,14 @@ class SteeredLocator:
             smear=steered.smear,
             floor=10 ** (settings.correlation.floor_dbfs / 10),
         )
-        rows, columns = np.meshgrid(self._search.elevation_rad, self._search.azimuth_rad, indexing="ij")
-        self._grid_u = np.stack(
-            [direction(float(a), float(e)) for a, e in zip(columns.ravel(), rows.ravel(), strict=True)]
-        )
+        self._rows, self._columns = len(self._search.elevation_rad), len(self._search.azimuth_rad)
+        self._top_rad = float(self._search.elevation_rad[0])
+        self._row_rad = self._top_rad - float(self._search.elevation_rad[1])
         first = self._search.first_bin
         self._band = slice(first, first + len(self._search.frequency_hz))
         self._weights: F32 = np.ones((len(self._spans_s), len(self._search.frequency_hz)), dtype=np.float32)
         places_m = settings.mic_array.positions_m - settings.mic_array.positions_m.mean(axis=0)
-        self._spread_m2: F64 = places_m.T @ places_m
+        self._spread_m2: list[list[float]] = (places_m.T @ places_m).tolist()
         self._tolerance_m = settings.array.tolerance_m
         self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
         self._mics = settings.mic_array.mics
@@ -104,7 +103,7 @@ class SteeredLocator:
         """Neither noise nor what has just been heard."""
         self._begin_anew()
         self._onsets = Onsets(self._hop_s)
-        self._scores = [0.0 for _ in self._spans_s]
+        self._scores: list[float | None] = [None for _ in self._spans_s]  # the best, where it was looked for
         self._ratios = [0.0 for _ in self._spans_s]  # how those stand out
         self._strange = [False for _ in self._spans_s]
         self._strange_hops = 0
@@ -138,20 +137,22 @@ class SteeredLocator:
         self, frame: Frame, _: Tdoa, elapsed_s: float, mask: Mask | None = None, /
     ) -> tuple[Bearing, ...]:
         power, bad_mics = self._search.listen(frame.samples)
-        failing = bad_mics != 0 or power.min() < DEAD * power.max()
+        levels = power.tolist()
+        loudest = max(levels)
+        failing = bad_mics != 0 or min(levels) < DEAD * loudest
         self._bad_hops = self._bad_hops + 1 if failing else 0
-        self._failing.append(bool(failing))
-        self._silent.append(bool(power.max() < SILENCE))
+        self._failing.append(failing)
+        self._silent.append(loudest < SILENCE)
         self._elapsed_s = elapsed_s
         self._mask = mask
         if elapsed_s > LAG_S:
             self._onsets.forget()
         found = [self._heard(span, elapsed_s) for span in range(len(self._spans_s))]
-        self._ratios = [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
         if self._to_learn > 0:
             return (no_bearing(NAME),)
+        best = self._best(found)
         self._end_of_a_loud_call()
-        return self._best(found) or (no_bearing(NAME, Evidence(min(max(self._ratios), MEANING), 0.0)),)
+        return best or (no_bearing(NAME, Evidence(min(max(self._ratios), MEANING), 0.0)),)
 
     def _best(self, found: list[list[Source]]) -> tuple[Bearing, ...]:
         """Of the spans: the frame where that is a call by itself, else whichever stands out more."""
@@ -161,7 +162,7 @@ class SteeredLocator:
             order = [0, *order]
         for span in order:
             # between a loud caller's sounds an average only tells where he was
-            if not found[span] or (span > 0 and self._loud_hops_ago):
+            if not found[span] or (span > 0 and self._loud_hops_ago is not None):
                 continue
             towards = self._nearest(found[span][0])
             # an average over a second remembers what has ended
@@ -193,23 +194,34 @@ class SteeredLocator:
         if self._mask is not None:
             weight = np.square(self._mask.weight[self._band])  # a gain's square is what is left of power
             self._weights[span] += np.float32(share) * (weight - self._weights[span])
+        self._strange[span] = False
+        if span > 0 and self._ratios[0] >= self._least_ratio:
+            # the frame places him, and in the average he stands out no less: half of the work is spared
+            self._scores[span], self._ratios[span] = None, self._ratios[0]
+            return []
         sources = self._sources(span)
         scores: F32 = self._search.map(span)
         if span == 0:
             self._onsets.hear(scores)
         best = float(scores.max())
-        self._scores[span] = max(best, sources[0].score if sources else 0.0)
-        self._strange[span] = False
         if not sources:
+            self._note(span, best)
             return []
-        if sources[0].contrast < LOUDER * sources[0].score or scores.min() > FLAT * best:
-            self._scores[span], self._strange[span] = 0.0, True
+        first = sources[0]
+        if first.contrast < LOUDER * first.score or float(scores.min()) > FLAT * best:
+            self._note(span, 0.0)
+            self._strange[span] = True
             return []
-        least = max(SECOND * sources[0].score, self._least_ratio * self._usual[span].level)
+        self._note(span, max(best, first.score))
+        least = max(SECOND * first.score, self._least_ratio * self._usual[span].level)
         return [s for n, s in enumerate(sources) if n == 0 or s.score > least]
 
+    def _note(self, span: int, score: float) -> None:
+        self._scores[span], self._ratios[span] = score, self._usual[span].ratio(score)
+
     def _sources(self, span: int) -> tuple[Source, ...]:
-        return self._search.search(2, span, MEANING * self._usual[span].known)
+        usual = self._usual[span]
+        return self._search.search(2, span, MEANING * usual.known, self._least_ratio * usual.level)
 
     def _placed(self, found: list[Source], span: int) -> list[Source]:
         """Callers once more, by the bins that are theirs; as they were found where those hold too little.
@@ -224,7 +236,9 @@ class SteeredLocator:
 
     def _nearest(self, source: Source) -> int:
         """On the grid."""
-        return int(np.argmax(self._grid_u @ direction(source.azimuth_rad, source.elevation_rad)))
+        row = round((self._top_rad - source.elevation_rad) / self._row_rad)
+        column = round(source.azimuth_rad * self._columns / math.tau) % self._columns
+        return min(max(row, 0), self._rows - 1) * self._columns + column
 
     def _told(self, source: Source, span: int, evidence: Evidence) -> Bearing:
         if _may_be_elsewhere(source):
@@ -252,14 +266,18 @@ class SteeredLocator:
         microphones' ways, as in `tolerance_rad`. A flat array sees the elevation through its cosine, which
         hardly changes near the horizon."""
         c, s = math.cos(source.azimuth_rad), math.sin(source.azimuth_rad)
-        level, below = max(math.cos(source.elevation_rad), 0.1), math.sin(source.elevation_rad)
-        arcs = np.array([[-s, c, 0.0], [-below * c, -below * s, -math.cos(source.elevation_rad)]])
-        seen = arcs @ self._spread_m2 @ arcs.T
+        level, below = math.cos(source.elevation_rad), math.sin(source.elevation_rad)
+        # Over the microphones, of the arc towards greater azimuth (-s, c, 0), of the other one
+        # (-below c, -below s, -level), and of both. Plain numbers: small arrays cost ten times as much.
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = self._spread_m2
+        along = c * c * xx + 2.0 * c * s * xy + s * s * yy
+        azimuth = s * s * xx - 2.0 * s * c * xy + c * c * yy
+        both = below * (s * c * (xx - yy) - (c * c - s * s) * xy) + level * (s * xz - c * yz)
+        elevation = below * below * along + 2.0 * below * level * (c * xz + s * yz) + level * level * zz
         # on the very horizon the second order is left: 1 - cos(error) is what the positions are off by
-        seen[1, 1] += 0.5 * self._tolerance * seen[0, 0]
-        determinant = float(seen[0, 0] * seen[1, 1] - seen[0, 1] * seen[1, 0])
-        scale = self._tolerance_m / math.sqrt(max(determinant, 1e-18))
-        return scale * math.sqrt(seen[1, 1]) / level, scale * math.sqrt(seen[0, 0])
+        elevation += 0.5 * self._tolerance * azimuth
+        scale = self._tolerance_m / math.sqrt(max(azimuth * elevation - both * both, 1e-18))
+        return scale * math.sqrt(max(elevation, 0.0)) / max(level, 0.1), scale * math.sqrt(max(azimuth, 0.0))
 
     def likeliest(self, span: int = 0) -> Bearing:
         """The best direction of a span's last frame, however little it stands out: to judge the search by."""
@@ -316,7 +334,8 @@ class SteeredLocator:
             if quiet and self._quiet_hops % self._lag == 0:
                 self._search.settle(1.0 - math.exp(-self._hop_s / WATCH_S), span)
         for usual, score in zip(self._usual, self._scores, strict=True):
-            usual.learn(score, self._elapsed_s)
+            if score is not None:
+                usual.learn(score, self._elapsed_s)
         if not self._usual[0].young and max(self._since_lag) < self._least_ratio:
             self._onsets.learn(self._lag, self._elapsed_s)
 
