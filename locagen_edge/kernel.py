@@ -321,10 +321,9 @@ class Steered:
     ) -> tuple[Source, ...]:
         """The sources in the span's matrix, strongest first; at most one less than there are microphones.
 
-        None before `hear`, in silence and with less than two microphones; none that scores `least` or less, and
-        beside the first none that scores `further` or less.
-        Where nothing was learnt the noise is taken for white, and its level from what is across the best
-        direction.
+        None before `hear`, in silence and with less than two microphones; none that scores `least` or less,
+        and beside the first none that scores `further` or less. Where nothing was learnt the noise is taken
+        for white, and its level from what is across the best direction.
         """
         room = min(max_sources, _MOST_MICS)
         found = _check(lib.locagen_steer_search(self._state, span, room, least, further, self._sources))

@@ -33,8 +33,8 @@ LOOKS = 5
 learnt from fewer is nearly singular, and whitening by it invents sources."""
 
 LAG_S = 0.5
-"""Noise is learnt so late: by then a call is known as one, and its beginning is not learnt. At the start it is
-learnt at once, for before the first bearing nothing can be known as a call."""
+"""Noise is learnt so late: by then a call is known as one, and its beginning is not learnt. At the start it
+is learnt at once, for before the first bearing nothing can be known as a call."""
 MEANING = 1.3
 """Evidence from which a direction means something, though not yet a call."""
 WATCH_S = 15.0
