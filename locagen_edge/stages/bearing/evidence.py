@@ -22,6 +22,9 @@ SCORE = 20.0
 """Added to the average: the least that noise gives, however still it keeps."""
 YOUNG, YOUNG_S = 600.0, 1.6
 """Added while the noise has just been learnt and is hardly known: falls by e in each of these times."""
+INFANT = YOUNG / 3.0
+"""While so much is added, scores tell of a matrix from few frames, and not of the noise. From then on they are
+averaged: rotors that hunt show it within seconds."""
 MEMORY_S = 20.0
 LOUDEST = 2.0
 """The average takes no more than so many times itself at once: a call that was not recognised."""
@@ -63,7 +66,7 @@ class Usual:
 
     def learn(self, score: float, elapsed_s: float) -> None:
         self._youth *= math.exp(-elapsed_s / YOUNG_S)
-        if self.young:
+        if self._youth > INFANT:
             return
         share = 1.0 - math.exp(-elapsed_s / MEMORY_S)
         self._sum += share * (min(score, LOUDEST * self.level) - self._sum)
