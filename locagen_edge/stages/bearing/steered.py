@@ -51,7 +51,7 @@ SILENCE = 1e-11
 RIVAL = 0.97
 """Score of another lobe over the best from which nobody knows which is true, however loud the caller: the
 microphones stand where they should to within their tolerance only."""
-CLOSER = 1.5
+CLOSER = 2.5
 """Roots of the score by which the best lobe has to be ahead of any other: chance gives as much. A whistle of
 3 kHz, whose wavelength is shorter than twice the array, has lobes that are nearly alike; a voice has one."""
 SECOND = 0.2
