@@ -901,6 +901,25 @@ static double contrast(const steer *s, const locagen_spread *spread, int n, int 
     return sum;
 }
 
+/* By how much the noise turns a direction of the grid more than theory knows, as variance: where q strayed wild
+ * times as far as it should have, noise beside noise, of 1 in q, pulls wild times as hard; source beside noise,
+ * q - 1, as ever. Each part of the band counts by its share of the information, f^2 (q - 1)^2 / q. */
+static double unrest(const steer *s, const locagen_spread *spread, int n)
+{
+    const locagen_response *r = &s->coarse;
+    double known = 0, pulled = 0;
+    if (spread->calm == NULL)
+        return 1;
+    for (int k = 0; k < r->bins; k++) {
+        double over = (double)spread->seen[place_in_spread(s, n) + (long)k * s->paths->width];
+        double f = s->spectrum.first_bin + (k + 0.5) * r->thinning, wild = 1 / (double)calmness(s, spread, n, k);
+        double information = (double)(r->looks[k] * trust(s, spread, n, k)) * f * f * over * over / (1 + over);
+        known += information;
+        pulled += information * (over + wild) / (over + 1);
+    }
+    return known > 0 ? pulled / known : 1;
+}
+
 static void add_null(steer *s, int source, const double u[3])
 {
     for (int m = 0; m < s->mics; m++) {
@@ -915,7 +934,7 @@ static void add_null(steer *s, int source, const double u[3])
     }
 }
 
-static locagen_source told(const aim *a, int mics)
+static locagen_source told(const aim *a, int mics, double unrest)
 {
     double azimuth[3], elevation[3];
     arcs(a->u, azimuth, elevation);
@@ -932,7 +951,7 @@ static locagen_source told(const aim *a, int mics)
         .elevation_rad = (float)atan2(-a->u[2], level),
         .score = (float)a->score,
         .snr = (float)fmax(0, (a->mean_q - 1) / __builtin_popcount((unsigned)mics)),
-        .information = {(float)-xx, (float)-xy, (float)-yy},
+        .information = {(float)(-xx / unrest), (float)(-xy / unrest), (float)(-yy / unrest)},
     };
 }
 
@@ -1013,7 +1032,7 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
         relax(s, how, &spread, t, sure, aims);
     for (int n = 0; n < found; n++) {
         aims[n].score = score[n], aims[n].mean_q = mean_q[n];
-        out[n] = told(&aims[n], how.mics);
+        out[n] = told(&aims[n], how.mics, unrest(s, &spread, aims[n].at));
         out[n].contrast = (float)first;
         out[n].rival = n == 0 ? (float)aims[0].rival : 0.0f;
     }

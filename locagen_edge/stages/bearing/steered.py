@@ -247,6 +247,12 @@ class SteeredLocator:
 
     def _placed_at(self, source: Source, span: int, evidence: Evidence | None) -> Bearing:
         azimuth_sigma, elevation_sigma = source.sigma_rad()
+        span_s = self._spans_s[span]
+        if evidence is not None and span_s > 0.0:
+            # A call that began t ago weighs 1 - exp(-t / span) in the average, and 1 - exp(-2 t / span) among the
+            # squares that make the variance: its looks are fewer than if it had gone on all the time.
+            fewer = math.sqrt(1.0 + math.exp(-evidence.since_s / span_s))
+            azimuth_sigma, elevation_sigma = fewer * azimuth_sigma, fewer * elevation_sigma
         of_azimuth, of_elevation = self._of_positions(source)
         azimuth_sigma = math.hypot(azimuth_sigma, of_azimuth)
         elevation_sigma = math.hypot(elevation_sigma, of_elevation)
@@ -258,7 +264,7 @@ class SteeredLocator:
             misfit=0.0,  # the score has judged already whether a source explains the frame
             estimator=NAME,
             evidence=evidence,
-            span_s=self._spans_s[span],
+            span_s=span_s,
         )
 
     def _of_positions(self, source: Source) -> tuple[float, float]:
