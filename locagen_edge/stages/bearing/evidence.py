@@ -23,8 +23,8 @@ SCORE = 20.0
 YOUNG, YOUNG_S = 600.0, 1.6
 """Added while the noise has just been learnt and is hardly known: falls by e in each of these times."""
 INFANT = YOUNG / 3.0
-"""While so much is added, scores tell of a matrix from few frames, and not of the noise. From then on they are
-averaged: rotors that hunt show it within seconds."""
+"""While so much is added, scores tell of a matrix from few frames, and not of the noise. From then on they
+are averaged: rotors that hunt show it within seconds."""
 MEMORY_S = 20.0
 LOUDEST = 2.0
 """The average takes no more than so many times itself at once: a call that was not recognised."""

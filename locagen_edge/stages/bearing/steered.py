@@ -249,8 +249,8 @@ class SteeredLocator:
         azimuth_sigma, elevation_sigma = source.sigma_rad()
         span_s = self._spans_s[span]
         if evidence is not None and span_s > 0.0:
-            # A call that began t ago weighs 1 - exp(-t / span) in the average, and 1 - exp(-2 t / span) among the
-            # squares that make the variance: its looks are fewer than if it had gone on all the time.
+            # A call that began t ago weighs 1 - exp(-t / span) in the average, and 1 - exp(-2 t / span) among
+            # the squares that make the variance: its looks are fewer than if it had gone on all the time.
             fewer = math.sqrt(1.0 + math.exp(-evidence.since_s / span_s))
             azimuth_sigma, elevation_sigma = fewer * azimuth_sigma, fewer * elevation_sigma
         of_azimuth, of_elevation = self._of_positions(source)
