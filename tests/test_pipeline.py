@@ -268,7 +268,7 @@ def test_a_second_after_the_start_a_caller_is_found():
 
 
 def test_after_a_loud_caller_has_stopped_his_average_is_not_told():
-    """What an average over a second still holds of him is no call, nor are the hops in which that is noticed."""
+    """What an average over a second still holds of him is no call, nor is the hop that notices it."""
     settings = from_table(EXACT)
     rate = settings.audio.rate_hz
     noise = 0.02 * np.random.default_rng(5).standard_normal((3, 8 * rate)).astype(np.float32)

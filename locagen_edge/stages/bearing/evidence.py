@@ -21,13 +21,11 @@ from locagen_edge.types import F32
 SCORE = 20.0
 """Added to the average: the least that noise gives, however still it keeps."""
 YOUNG, YOUNG_S = 600.0, 1.6
-"""Added while the noise has just been learnt and is hardly known: falls by e in each of these times."""
-INFANT = YOUNG / 3.0
-"""While so much is added, scores tell of a matrix from few frames, and not of the noise. From then on they
-are averaged: rotors that hunt show it within seconds."""
+"""The average counts as at least so much while the noise has just been learnt, of a matrix from few frames;
+falls by e in each of these times."""
 MEMORY_S = 20.0
-LOUDEST = 2.0
-"""The average takes no more than so many times itself at once: a call that was not recognised."""
+LOUDEST = 3.0
+"""The average takes no more than so many times its level at once: a call that was not recognised."""
 CLIP = 60.0
 """A frame's score counts up to here, so that one clap does not outweigh a second of voice."""
 DRIFT = 3.0
@@ -43,13 +41,12 @@ RISE_S = 0.08
 
 
 class Usual:
-    """What the best score of noise alone is, on average."""
+    """What the best score of noise alone is, on average: at first of late, for rotors that hunt show it within
+    seconds; then of `MEMORY_S`."""
 
     def __init__(self) -> None:
-        self._sum = self._weight = 0.0
+        self._average, self._frames = 0.0, 0
         self._youth = YOUNG
-        self.known = SCORE
-        """the score whose ratio is 1, without what is added for the noise being hardly known yet"""
 
     def ratio(self, score: float) -> float:
         return score / self.level
@@ -62,16 +59,20 @@ class Usual:
     @property
     def level(self) -> float:
         """The score whose ratio is 1."""
-        return self.known + self._youth
+        return SCORE + max(self._average, self._youth)
+
+    @property
+    def known(self) -> float:
+        """The same without what the noise counts as for being hardly known yet."""
+        return SCORE + self._average
 
     def learn(self, score: float, elapsed_s: float) -> None:
+        most = LOUDEST * self.level
         self._youth *= math.exp(-elapsed_s / YOUNG_S)
-        if self._youth > INFANT:
-            return
-        share = 1.0 - math.exp(-elapsed_s / MEMORY_S)
-        self._sum += share * (min(score, LOUDEST * self.level) - self._sum)
-        self._weight += share * (1.0 - self._weight)
-        self.known = SCORE + self._sum / self._weight
+        self._frames += 1
+        # 2 / (n + 1): each score weighs as much as the number of those before it
+        share = max(1.0 - math.exp(-elapsed_s / MEMORY_S), 2.0 / (self._frames + 1))
+        self._average += share * (min(score, most) - self._average)
 
 
 class Onsets:
