@@ -7,13 +7,15 @@ beforehand, resampled by the daemon, so that the synthesis costs it nothing. Cha
 
     paper    GCC-PHAT and a plane wave's least squares (bearing.estimator = "far-field")
     steered  the default
+    card     the default, and the sound comes from a sound card (a virtual one, through ALSA and PortAudio)
     mask     the default with the network that says which frequencies are the caller's
 
 and, in the same run, `plain_daemon.py`: numpy and mavutil, as most people would write it.
 
 CPU is the process's own time (user and system, without its start) over the wall's. PSS is what
 /proc/PID/smaps_rollup says at the end. Delay is from a frame's last sample to the datagram on the loopback,
-as the kernel has stamped it; there the daemon sends every frame's bearing (mavlink.rate_hz = 20). Growth:
+as the kernel has stamped it; the resampler's wait is in it for `card` only, a recording is read ahead. There
+the daemon sends every frame's bearing (mavlink.rate_hz = 20). Growth:
 frames go through pipeline and MAVLink component in this process as fast as they can; slope of its resident
 memory over the second half. `nothing` is what as many wake-ups cost without any work: a loop of asyncio that
 hands an empty job to a thread at every hop. The process runs in an empty folder with a home of its own: what
@@ -54,9 +56,13 @@ from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import from_table
 from locagen_edge.sim.scene import Scene, frames
 
+sys.path.insert(0, str(report.ROOT / "tests"))
+from alsa import card
+
 CHAINS: dict[str, dict[str, Any]] = {
     "paper": {"bearing": {"estimator": "far-field"}},
     "steered": {},
+    "card": {"audio": {"source": "alsa", "device": "array3", "device_channels": 3}},
     "mask": {"denoise": {"kind": "mask"}},
 }
 GOALS: dict[str, dict[str, float]] = {
@@ -65,7 +71,7 @@ GOALS: dict[str, dict[str, float]] = {
 }
 DELAY_GOAL_MS = {"median": 2.0, "p99": 5.0}
 RATE_HZ = 48_000
-QUIET_S = {"paper": 0.3, "steered": 0.85, "mask": 0.85}
+QUIET_S = {"paper": 0.3, "steered": 0.85, "card": 0.85, "mask": 0.85}
 """Noise before the first call: the steered estimator has to have heard the rotors before it hears anybody."""
 WINDOW_S = 5.0
 """CPU is told of the least busy and the middling one of such windows: a machine has other things to do."""
@@ -116,6 +122,14 @@ def render(path: Path, seconds: float, quiet_s: float) -> None:
             file.write((late[:, : call.shape[1]] + sum(others)).T)
 
 
+def card_of(sound: Path, folder: Path) -> dict[str, str]:
+    """The environment in which ALSA knows a card that plays the sound, from its begin at each opening."""
+    folder.mkdir()
+    rows, rate_hz = soundfile.read(sound)
+    virtual = card.VirtualCard(card.build(folder), folder, name="array3", rate_hz=rate_hz, rows=rows)
+    return {"ALSA_CONFIG_PATH": str(virtual.directory / "asound.conf")}
+
+
 def write_settings(path: Path, sound: Path, port: int, table: dict[str, Any], rate_hz: float) -> None:
     tables = {
         "audio": {"source": "wav", "file": str(sound)},
@@ -143,7 +157,7 @@ class Peer:
         self._socket.settimeout(0.2)
         self.port = int(self._socket.getsockname()[1])
         self._open = True
-        self._thread = threading.Thread(target=self._take)
+        self._thread = threading.Thread(target=self._take, daemon=True)
         self._thread.start()
 
     def _take(self) -> None:
@@ -234,10 +248,11 @@ def listing(folder: Path) -> set[str]:
 
 
 class Home:
-    """A place of its own to run in: what is written shows."""
+    """A place of its own to run in, with more in its environment if need be: what is written shows."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, more: dict[str, str] | None = None) -> None:
         self.folder = folder
+        self._more = more or {}
         for name in ("home", "tmp", "state", "work"):
             (folder / name).mkdir(parents=True)
 
@@ -251,6 +266,7 @@ class Home:
             "PYTHONPATH": str(report.ROOT),
             "OPENBLAS_NUM_THREADS": "1",  # as in the unit
             "PYTHONDONTWRITEBYTECODE": "1",
+            **self._more,
         }
 
     def start(self, command: list[str]) -> subprocess.Popen[bytes]:
@@ -331,15 +347,16 @@ def chain(name: str, folder: Path, times: Times) -> dict[str, Any]:
     sound = folder / f"{name}.wav"
     render(sound, max(times.warm + times.measure, times.listen) + 5.0, QUIET_S[name])
     settings = folder / f"{name}.toml"
+    more = card_of(sound, folder / "sound-card") if name == "card" else {}
     command = [sys.executable, "-m", "locagen_edge", "run", "--quiet", "--settings", str(settings)]
     hop = from_table({})
     frame_s = hop.audio.frame / hop.audio.rate_hz
 
     peer = Peer()  # somebody listens, or each datagram costs an error as well
     write_settings(settings, sound, peer.port, CHAINS[name], 2.0)
-    found = measure(command, Home(folder / f"{name}-cpu"), times)
+    found = measure(command, Home(folder / f"{name}-cpu", more), times)
     found["files_opened_for_writing"] = opened_for_writing(
-        command, Home(folder / f"{name}-files"), times.trace
+        command, Home(folder / f"{name}-files", more), times.trace
     )
     peer.close()
 
@@ -347,7 +364,7 @@ def chain(name: str, folder: Path, times: Times) -> dict[str, Any]:
     for run in range(times.starts):
         peer = Peer()
         write_settings(settings, sound, peer.port, CHAINS[name], 20.0)
-        start_ns, datagrams = listen(command, Home(folder / f"{name}-{run}"), peer, times.listen)
+        start_ns, datagrams = listen(command, Home(folder / f"{name}-{run}", more), peer, times.listen)
         heard = ours(datagrams, frame_s)
         delays += heard.delays_s
         if heard.first_ns:
@@ -439,8 +456,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for chosen in list(CHAINS)[:1] if options.quick else CHAINS:
-            results[chosen] = chain(chosen, folder, times)
-            show(chosen, results[chosen])
+            try:
+                results[chosen] = chain(chosen, folder, times)
+            except card.Missing as missing:
+                print(f"{chosen:10}left out: {missing}")
+            else:
+                show(chosen, results[chosen])
         results["plain"] = plain_daemon(folder, times)
         show("plain", results["plain"])
         results["nothing"] = measure([sys.executable, "-c", NOTHING], Home(folder / "nothing"), times)

@@ -22,7 +22,7 @@ CFLAGS = [
     "-Wall",
     "-Wextra",
 ]
-SOURCES = ["gcc_phat.c", "steering.c", "spectrum.c", "fft.c", "frame_quad.c", "frame_avx2.c"]
+SOURCES = ["gcc_phat.c", "steering.c", "spectrum.c", "fft.c", "frame_quad.c", "frame_avx2.c", "resample.c"]
 HEADERS = sorted(path.name for path in HERE.glob("*.h"))
 
 header = (HERE / "locagen.h").read_text(encoding="utf-8")

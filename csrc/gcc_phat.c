@@ -262,6 +262,8 @@ const char *locagen_strerror(int code)
         return "weights: 0 to 1 are needed";
     case LOCAGEN_E_LEAST:
         return "least score: 0 or more is needed";
+    case LOCAGEN_E_RESAMPLE:
+        return "resampling: taps must be a multiple of 16, nothing below zero, and samples enough";
     case LOCAGEN_E_COUNT:
         return "sources: at least one must be asked for";
     default:

@@ -1,4 +1,5 @@
-/* locagen.h - the whole C API of the acoustic kernel: two ways from a frame to where its sound comes from.
+/* locagen.h - the whole C API of the acoustic kernel: from a card's rate to the processing rate, and two ways
+ * from a frame to where its sound comes from.
  *
  * locagen_gcc: GCC-PHAT (Knapp & Carter 1976, "The generalized correlation method for estimation of time
  * delay") of all microphone pairs of one frame: window, real FFT, whitening, and only those lags
@@ -17,6 +18,9 @@
  * array signal processing research". A tapered window makes T less than the number of frames by
  * sum(w^2)^2 / (N sum(w^4)) (0.95 at taper 0.1, 0.51 for Hann), overlapping frames make it less again: so the
  * score's own curvature is the information on the direction, without another factor.
+ *
+ * locagen_resample: a polyphase FIR filter (Crochiere & Rabiner 1983, Multirate Digital Signal Processing,
+ * section 3.3), without a state and without blocks: each sample can be had as soon as what it is made of is there.
  *
  * Conventions, the same words as in Python:
  *   layout    float32, full scale 1.0, microphone by microphone: in[m * frame + n]
@@ -67,8 +71,17 @@ enum locagen_error {
     LOCAGEN_E_SPAN = -16,   /* spans: 1 to 4, counted from 0 */
     LOCAGEN_E_LAG = -17,    /* lag: 0 to 64 hops */
     LOCAGEN_E_WEIGHT = -18, /* weights: 0 to 1 */
-    LOCAGEN_E_LEAST = -19   /* least score: 0 or more */
+    LOCAGEN_E_LEAST = -19,  /* least score: 0 or more */
+    LOCAGEN_E_RESAMPLE = -20 /* taps: a multiple of LOCAGEN_TAPS; nothing below zero, and samples enough */
 };
+
+enum { LOCAGEN_TAPS = 16 };
+
+/* Sample n of `count` of each microphone: the sum over j of table[phase * taps + j] * in[m * samples + start + j],
+ * start and phase being quotient and remainder of (at + n * down) / up. table: [up][taps]. in: [mics][samples].
+ * out: [count][mics]. Each sample is added up in the same order, however a stream is cut. */
+int locagen_resample(const float *table, int32_t taps, int32_t up, int32_t down, int32_t at, const float *in,
+                     int32_t mics, int32_t samples, float *out, int32_t count);
 
 typedef struct {
     int32_t mics;

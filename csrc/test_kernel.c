@@ -330,7 +330,7 @@ static void test_refusals(void)
     for (int code = LOCAGEN_E_LEAST - 1; code <= 1; code++) {
         const char *words = locagen_strerror(code);
         CHECK(strlen(words) > 5, "code %d", code);
-        CHECK((strcmp(words, locagen_strerror(INT32_MIN)) == 0) == (code < LOCAGEN_E_LEAST), "code %d", code);
+        CHECK((strcmp(words, locagen_strerror(INT32_MIN)) == 0) == (code < LOCAGEN_E_RESAMPLE), "code %d", code);
     }
 }
 
@@ -756,6 +756,38 @@ static void test_steered_refusals(void)
     steer_tear_down(&b);
 }
 
+/* Memory just as large as needed: a sanitizer sees one tap too far. */
+static void test_resample(void)
+{
+    enum { UP = 5, DOWN = 24, TAPS = 3 * LOCAGEN_TAPS, COUNT = 7, AT = 3 };
+    enum { SAMPLES = (AT + (COUNT - 1) * DOWN) / UP + TAPS };
+    for (int mics = 1; mics <= 8; mics++) {
+        float *table = allocate(sizeof(float) * UP * TAPS), *in = allocate(sizeof(float) * (size_t)mics * SAMPLES);
+        float *out = allocate(sizeof(float) * (size_t)mics * COUNT);
+        for (int n = 0; n < UP * TAPS; n++)
+            table[n] = uniform();
+        for (int n = 0; n < mics * SAMPLES; n++)
+            in[n] = uniform();
+        int code = locagen_resample(table, TAPS, UP, DOWN, AT, in, mics, SAMPLES, out, COUNT);
+        CHECK(code == 0, "code %d", code);
+        for (int n = 0; n < COUNT; n++)
+            for (int m = 0; m < mics; m++) {
+                int place = AT + n * DOWN;
+                double sum = 0;
+                for (int j = 0; j < TAPS; j++)
+                    sum += (double)table[place % UP * TAPS + j] * in[m * SAMPLES + place / UP + j];
+                CHECK(fabs(sum - out[n * mics + m]) < 1e-5, "row %d, microphone %d: %g", n, m, sum);
+            }
+        CHECK(locagen_resample(table, TAPS, UP, DOWN, AT, in, mics, SAMPLES - 1, out, COUNT) == LOCAGEN_E_RESAMPLE,
+              "a sample too few");
+        CHECK(locagen_resample(table, TAPS, UP, DOWN, AT, in, mics, 0, out, 0) == 0, "nothing of nothing");
+        CHECK(locagen_resample(table, TAPS - 1, UP, DOWN, AT, in, mics, SAMPLES, out, COUNT) == LOCAGEN_E_RESAMPLE,
+              "taps");
+        CHECK(locagen_resample(NULL, TAPS, UP, DOWN, AT, in, mics, SAMPLES, out, COUNT) == LOCAGEN_E_NULL, "null");
+        free(table), free(in), free(out);
+    }
+}
+
 int main(void)
 {
 #if defined(__x86_64__)
@@ -776,6 +808,7 @@ int main(void)
     }
     test_paths_agree();
     test_refusals();
+    test_resample();
     test_steered_paths_agree();
     test_steered_refusals();
     printf("%d passed, %d failed (vector widths: %d)\n", passed, failed, path_count);

@@ -62,6 +62,10 @@ class Aligner:
         ready = [np.convolve(held[:, m], taps, mode="valid") for m, taps in enumerate(self._filters)]
         return np.stack(ready, axis=1).astype(np.float32)
 
+    def missing(self, rows_out: int) -> int:
+        """How many more rows have to come in until so many more come out."""
+        return rows_out + 2 * self._reach - len(self._held)
+
     def flush(self, rows: F32) -> F32:
         """The last rows, and all that is still inside. Afterwards a new stream may begin."""
         end = np.zeros((self._reach, self._mics), dtype=np.float32)

@@ -89,7 +89,7 @@ def hear(path: Path, settings: Settings, margin: float) -> Heard:
         frames += 1
         correlation = correlate(frame)
         tdoa = pick(correlation)
-        wrong, _ = alone(frame, correlation)  # where they stand is what is asked for
+        wrong, _ = alone(frame, correlation, frame.clipped)  # where they stand is what is asked for
         faults.update(wrong)
         troughs.append(_trough(correlation))
         if not wrong and np.all(np.isfinite(tdoa.delay_s)):

@@ -74,6 +74,11 @@ class Framer:
         self._start += at
         return frames
 
+    @property
+    def missing(self) -> int:
+        """How many more samples make the next frame whole."""
+        return self._frame - len(self._held[0])
+
     def gap(self, overruns: int = 1) -> None:
         """Sound was lost here, `overruns` times: what has not filled a frame is dropped.
 

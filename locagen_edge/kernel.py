@@ -359,6 +359,36 @@ class Steered:
         _check(lib.locagen_steer_reset(self._state))
 
 
+TAPS: int = lib.LOCAGEN_TAPS
+"""Filters of `resample` have a multiple of so many."""
+
+
+def resample(
+    table: npt.NDArray[np.float32], up: int, down: int, at: int, samples: npt.NDArray[np.float32], count: int
+) -> npt.NDArray[np.float32]:
+    """`count` rows of a polyphase filter's output, float32, shape `(count, mics)`.
+
+    Row `n` holds, for each microphone, the scalar product of `table[phase]` with what begins at
+    `samples[:, start]`, where `start, phase = divmod(at + n * down, up)`.
+
+    Args:
+        table: float32, C-contiguous, shape `(up, taps)`, taps a multiple of `TAPS`.
+        samples: float32, C-contiguous, shape `(mics, n)`.
+
+    Raises:
+        KernelError: a wrong type, shape or layout, or samples that end too early.
+    """
+    mics, length = samples.shape
+    rows = np.empty((count, mics), _FLOAT32)
+    _check(
+        lib.locagen_resample(
+            _pointer(table, (up, table.shape[-1])), table.shape[-1], up, down, at,
+            _pointer(samples, samples.shape), mics, length, ffi.from_buffer(_FLOATS, rows), count,
+        )
+    )  # fmt: skip
+    return rows
+
+
 def _check(code: int) -> int:
     if code < 0:
         raise KernelError(ffi.string(lib.locagen_strerror(code)).decode())

@@ -18,9 +18,9 @@ import numpy as np
 from locagen_edge.types import Drift
 
 LOSS_S = 0.05  # more than the coarsest pointer of a USB card moves at once (a few ms to 20 ms)
-LOSS_POLLS = 10  # a late pointer recovers within a poll or two; sound that is lost stays lost
+LOSS_POLLS = 5  # a late pointer recovers within a poll or two; sound that is lost stays lost
 CERTAIN_S = 0.5  # more than a card's whole buffer: no pointer lags so far, and none has to be waited for
-DRIFT_POLLS = 500  # 10 s: jitter averages out, and 100 ppm of clock error lag by 1 ms
+DRIFT_S = 10.0  # jitter averages out, and 100 ppm of clock error lag by 1 ms
 POINT_NS = 250_000_000
 POINTS = 2400
 LEAST_POINTS = 6
@@ -46,6 +46,7 @@ class SampleClock:
         self._polls = 0
         self._late_ns: collections.deque[int] = collections.deque(maxlen=LOSS_POLLS)
         self._first_ns = 0  # origin at the first poll
+        self._asked_ns = 0
         self._since: list[int] = []  # origins since the last point, less the first
         self._since_ns = 0
         self._points: collections.deque[tuple[float, float]] = collections.deque(maxlen=POINTS)
@@ -56,13 +57,15 @@ class SampleClock:
         origin_ns = now_ns - round(samples * 1e9 / self._rate_hz)
         if self._polls == 0:
             self.origin_ns = self._first_ns = origin_ns
-            self._since_ns = now_ns
+            self._since_ns = self._asked_ns = now_ns
         late_ns = origin_ns - self.origin_ns
         if abs(late_ns) > CERTAIN_S * 1e9:
             return False
         self._late_ns.append(late_ns)
         self._polls += 1
-        self.origin_ns += round(late_ns / min(self._polls, DRIFT_POLLS))
+        share = max(1.0 / self._polls, 1.0 - math.exp((self._asked_ns - now_ns) / (DRIFT_S * 1e9)))
+        self._asked_ns = now_ns
+        self.origin_ns += round(late_ns * share)
         lasting = len(self._late_ns) == LOSS_POLLS
         limit_ns = LOSS_S * 1e9
         if lasting and (min(self._late_ns) > limit_ns or max(self._late_ns) < -limit_ns):

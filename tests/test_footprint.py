@@ -41,7 +41,7 @@ print(json.dumps(found))
 """
 
 ALWAYS = {"numpy", "_cffi_backend", "fastcrc"}
-SOUND = {"soundfile", "_soundfile", "_soundfile_data", "soxr", "typing_extensions"}
+SOUND = {"soundfile", "_soundfile", "_soundfile_data", "typing_extensions"}
 PORTAUDIO = {"sounddevice", "_sounddevice", "_sounddevice_data"}
 SIM = '[audio]\nsource = "sim"\n'
 CASES = {

@@ -19,7 +19,7 @@ from locagen_edge.sampleclock import LOSS_S, SampleClock
 from locagen_edge.settings import from_table
 from locagen_edge.stages import mic
 from locagen_edge.stages.mic import (
-    POLL_S,
+    LATEST_S,
     Device,
     _choose,
     _Mailbox,
@@ -232,7 +232,7 @@ class FakeCard:
 
     @property
     def read_available(self):
-        return round((self.now - self.begin) * 1e-9 * self.rate_hz) - self.lost - self.done
+        return max(round((self.now - self.begin) * 1e-9 * self.rate_hz) - self.lost - self.done, 0)
 
     def read(self, rows):
         number = self.done + np.arange(rows)[:, np.newaxis]
@@ -248,7 +248,8 @@ class FakeCard:
 def test_a_card_gives_every_row_in_order_and_maps_channels():
     card = FakeCard()
     frames = card.frames()
-    assert [f.start for f in frames] == list(range(0, 100 * 200 - FRAME + 1, HOP))
+    assert [f.start for f in frames] == list(range(0, card.done - FRAME + 1, HOP))
+    assert 90 <= len(frames) <= 100  # of 100 questions to the card nearly all were in time for a frame
     for frame in frames:
         assert frame.overruns == 0
         assert frame.t_ns == card.begin + frame.start * 100_000
@@ -284,7 +285,8 @@ def test_sound_lost_in_silence_is_seen_against_the_clock():
     card.script = {60: lambda: setattr(card, "lost", round(2 * LOSS_S * card.rate_hz))}
     frames = card.frames()
     assert sum(f.overruns for f in frames) == 1
-    after = [f for f in frames if f.start > frames[0].start + 15_000]
+    after = [f for f in frames if f.start > frames[0].start + 30_000]
+    assert after
     for frame in after:  # by then the clock has been set anew
         heard_ns = card.begin + (frame.samples[1, 0] + card.lost) * 100_000
         assert frame.t_ns == pytest.approx(heard_ns, abs=1_000_000)
@@ -304,13 +306,18 @@ def test_a_wrong_crystal_is_followed_and_never_taken_for_a_loss(ppm):
 
 def test_a_card_that_stands_still_is_given_up_after_stall_s():
     card = FakeCard(polls=1000)
-    card.script = {900: lambda: setattr(card, "rate_hz", 0.0)}
+    stopped_ns = []
+
+    def stop():
+        stopped_ns.append(card.now)
+        card.lost = round(1e9)  # a pointer that does not move any more
+
+    card.script = {900: stop}
     heard = []
     settings = make(device_rate_hz=10_000, device_channels=4)
     with pytest.raises(SourceError, match="the default device: no sound for 2 s"):
         heard.extend(capture(card, settings, card.wait, card.now_ns))
-    stalled_s = 2.0 / POLL_S
-    assert 900 - card.polls == pytest.approx(stalled_s, abs=2)
+    assert (card.now - stopped_ns[0]) * 1e-9 == pytest.approx(2.0, abs=LATEST_S)
 
 
 def test_int16_is_scaled_to_full_scale_one():
@@ -389,7 +396,7 @@ import sys, asyncio
 from locagen_edge.sources import open_source
 from locagen_edge.settings import Settings
 asyncio.run(anext(open_source(Settings())))
-print([m for m in ("sounddevice", "soundfile", "soxr") if m in sys.modules])
+print([m for m in ("sounddevice", "soundfile") if m in sys.modules])
 import locagen_edge.stages.mic
 print("sounddevice" in sys.modules)
 """

@@ -182,7 +182,7 @@ def test_a_disk_that_is_too_slow_loses_blocks_and_counts_them(tmp_path, monkeypa
         recorder.block(np.full((512, 3), number, dtype=np.float32), 10_000, 0)
     assert recorder.progress().lost >= 39
     gate.set()
-    while recorder._worker._queue.qsize() > 1:  # room again
+    while recorder._worker.waiting > 1:  # room again
         gate.wait(0.01)
     lost = recorder.progress().lost
     for _ in range(4):

@@ -1,7 +1,7 @@
 """Frame, Correlation and Tdoa -> what is wrong with the microphones, in words for the operator.
 
 A symptom becomes a fault once it has held for most of a second, and is forgotten as slowly. Those of single
-channels (level, clipping) show in every frame. Those between channels (sign, delay, coherence) show only in
+channels (level, clipping) show in any sound. Those between channels (sign, delay, coherence) show only in
 a sound that is common to all and wide enough to have one delay; frames without one say nothing either way, so
 that claps are as good as an engine.
 
@@ -46,7 +46,7 @@ MISFIT = 10.0
 """Sigmas. One far source with strong peaks gives about 1; microphones of a square swapped, 17 to 110."""
 
 AUDIT_S = 0.2
-"""How often pairs are looked at over wide lags: symptoms between channels last."""
+"""How often microphones are looked at: symptoms last."""
 WIDE = 8
 """Parts of a frame that the widest lag is one of: 13 ms by default."""
 FINE = 4
@@ -176,9 +176,9 @@ def between(pairs: tuple[tuple[int, int], ...], verdicts: list[str | None], mics
     return found
 
 
-def alone(frame: Frame, correlation: Correlation) -> tuple[set[str], set[int]]:
+def alone(frame: Frame, correlation: Correlation, clipped: int) -> tuple[set[str], set[int]]:
     """What is wrong with channels by themselves, in words, and which of them hear; microphones counted from 0
-    as in the settings."""
+    as in the settings. `clipped`: bit m says that the converter has cut microphone m off of late."""
     samples = frame.samples
     mics = range(len(samples))
     broken = {m for m in mics if correlation.bad_mics >> m & 1}
@@ -196,7 +196,7 @@ def alone(frame: Frame, correlation: Correlation) -> tuple[set[str], set[int]]:
         if m in broken:
             continue
         at_the_end = peak[m] >= FULL_SCALE and np.mean(magnitude[m] >= FULL_SCALE) > CLIPPED_SHARE
-        if at_the_end or frame.clipped >> m & 1:
+        if at_the_end or clipped >> m & 1:
             found.add(f"microphone {m}: clipped, the gain is too high")
         if peak[m] > OFFSET and abs(samples[m].mean()) > OFFSET:
             found.add(f"microphone {m}: a constant offset, over a tenth of full scale")
@@ -224,6 +224,7 @@ class FaultFinder:
         self._between: set[str] = set()
         """texts of faults between channels that have been seen"""
         self._audit_s = AUDIT_S
+        self._clipped = 0
         self._verdicts: list[str | None] = [None] * len(self._wide.pairs)
         """the latest of each pair: a frame may tell of some pairs only"""
 
@@ -241,11 +242,13 @@ class FaultFinder:
         self, frame: Frame, correlation: Correlation, tdoa: Tdoa, elapsed_s: float
     ) -> tuple[str, ...]:
         """`elapsed_s`: since the previous frame."""
-        found, live = alone(frame, correlation)
-        self._follow(found, self._share.keys() - self._between, elapsed_s)
         self._audit_s += elapsed_s
+        self._clipped |= frame.clipped
         if self._audit_s >= AUDIT_S:
             elapsed_s, self._audit_s = min(self._audit_s, 2 * AUDIT_S), 0.0
+            found, live = alone(frame, correlation, self._clipped)
+            self._clipped = 0
+            self._follow(found, self._share.keys() - self._between, elapsed_s)
             if (common := self._common(frame, tdoa, live, found)) is not None:
                 self._between |= common
                 self._follow(common, self._share.keys() & self._between, elapsed_s)

@@ -1,7 +1,8 @@
 """Frames from microphones (ALSA, through PortAudio) and from recordings (through libsndfile).
 
 The card is read by one helper thread, which owns everything of PortAudio, and which never waits inside it: it
-asks how much is there, and reads just that. So, other than with PortAudio's callbacks,
+sleeps until the next frame should be whole, asks how much is there, and reads just that. So, other than with
+PortAudio's callbacks,
 - a card that stands still or goes away is seen within one poll: a kernel card that is pulled never calls
   back and lets PortAudio's own thread spin, but a question to it is answered with "no such device";
 - the number of samples still unread makes the time stamp exact, however late the thread is;
@@ -41,7 +42,8 @@ from locagen_edge.types import Array, Frame, Pose
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.02  # 50 wake-ups a second; less than half the default hop
+POLL_S = 0.005  # between questions to a card that has nothing new: its pointer may move in steps
+SOONEST_S, LATEST_S = 0.002, 0.1  # until the next question to one that had; its buffer is four times as long
 LATENCY_S = 0.4  # the card's buffer: what may pile up while this process does not get to run; delays nothing
 CARDS = Path("/proc/asound")  # where the kernel tells its cards' ids
 TURN_S = 0.5  # what one turn of waiting counts at most: a process that was suspended has not waited
@@ -82,6 +84,11 @@ class _Cutter:
         clipped = sum(1 << m for m, full in enumerate(self._full) if full > CLIPPED_SHARE * self._rows)
         self._full[:], self._rows = 0, 0
         return [replace(frame, clipped=clipped) for frame in frames] if clipped else frames
+
+    @property
+    def missing(self) -> int:
+        """How many more rows make the next frame whole."""
+        return self._resampler.missing(self._aligner.missing(self.framer.missing))
 
     def finish(self) -> list[Frame]:
         """The last frames: resampler and aligner give up all they hold."""
@@ -275,10 +282,12 @@ def capture(
     samples = 0
     quiet_ns = 0
     asked_ns = now_ns()
-    while not wait(POLL_S):
+    wait_s = POLL_S
+    while not wait(wait_s):
         before_ns, asked_ns = asked_ns, now_ns()
         waiting = stream.read_available
         if not waiting:
+            wait_s = POLL_S
             quiet_ns += min(asked_ns - before_ns, round(TURN_S * 1e9))
             if quiet_ns > settings.daemon.stall_s * 1e9:
                 raise SourceError(f"{_label(settings)}: no sound for {settings.daemon.stall_s:g} s")
@@ -298,6 +307,7 @@ def capture(
         cutter.framer.origin_ns = clock.origin_ns
         for frame in cutter.push(rows):
             yield frame if clock.drift is None else replace(frame, drift=clock.drift)
+        wait_s = min(max(cutter.missing / rate_hz, SOONEST_S), LATEST_S)
 
 
 def _portaudio() -> ModuleType:

@@ -119,7 +119,7 @@ class BlackBox:
         self._called = 0
         self._faults: dict[str, int] = {}  # and when each was last there
         self._worker: Worker[_Heard | Record] = Worker(
-            "black box", WAITING, self._write, self._sync_if_due, self._end
+            "black box", WAITING, self._write, self._sync_if_due, self._end, self._sync_s
         )
         self._worker.put(
             _now("start", version=__version__, settings=dataclasses.asdict(settings)),
@@ -152,7 +152,6 @@ class BlackBox:
             self._append(item, urgent=True)
         else:
             self._hear(item)
-        self._sync_if_due()
 
     def _hear(self, heard: _Heard) -> None:
         estimate = heard.estimate

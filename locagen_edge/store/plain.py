@@ -7,8 +7,10 @@ name becoming `_deg`, an azimuth from 0 to 360; what is not a finite number beco
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from typing import Any
+from collections.abc import Callable, Hashable
+from typing import Any, cast
 
 import numpy as np
 
@@ -19,27 +21,47 @@ DIGITS = 6
 LONG = ("latitude_deg", "longitude_deg")
 
 
+AS_IT_IS = frozenset({type(None), bool, int, str})
+
+
 def plain(value: Any) -> Any:
     """Dictionaries, lists, texts and numbers."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return dict(_entry(f.name, getattr(value, f.name)) for f in dataclasses.fields(value))
-    if isinstance(value, (tuple, list, np.ndarray)):
-        return [plain(item) for item in value]
-    if isinstance(value, (float, np.floating)):
+    kind = type(value)
+    if kind is float or isinstance(value, np.floating):
         return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
-    if isinstance(value, np.bool_):
-        return bool(value)
-    if isinstance(value, np.integer):
-        return int(value)
+    if kind in AS_IT_IS:
+        return value
+    if isinstance(value, (tuple, list)):
+        return [plain(item) for item in value]
+    if isinstance(value, (np.ndarray, np.bool_, np.integer)):
+        return plain(value.tolist())
+    if dataclasses.is_dataclass(value):
+        return {name: tell(getattr(value, field)) for field, name, tell in _entries(cast(Hashable, kind))}
     return value
 
 
-def _entry(name: str, value: Any) -> tuple[str, Any]:
-    if name in LONG and value is not None:
-        return name, round(float(value), 8) if math.isfinite(value) else None
+@functools.cache
+def _entries(kind: Any) -> list[tuple[str, str, Callable[[Any], Any]]]:
+    """Of a dataclass: its fields, their names here, and what makes plain values of them."""
+    return [(field.name, *_entry(field.name)) for field in dataclasses.fields(kind)]
+
+
+def _entry(name: str) -> tuple[str, Callable[[Any], Any]]:
+    if name in LONG:
+        return name, _degrees_of_place
     if not name.endswith("_rad"):
-        return name, plain(value)
+        return name, plain
     name = name.removesuffix("_rad") + "_deg"
-    if value is None or not math.isfinite(value):
-        return name, None
-    return name, plain(compass_deg(value) if name == "azimuth_deg" else math.degrees(value))
+    return name, _compass if name == "azimuth_deg" else _degrees
+
+
+def _degrees_of_place(value: Any) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(float(value), 8)
+
+
+def _compass(value: Any) -> float | None:
+    return None if value is None or not math.isfinite(value) else plain(compass_deg(value))
+
+
+def _degrees(value: Any) -> float | None:
+    return None if value is None or not math.isfinite(value) else plain(math.degrees(value))

@@ -81,7 +81,7 @@ class Recorder:
         if self._failure:
             raise StorageError(self._failure)
         self._worker: Worker[Block | bytes] = Worker(
-            "recorder", WAITING, self._write, self._sync_if_due, self._end
+            "recorder", WAITING, self._write, self._sync_if_due, self._end, settings.record.sync_s
         )
 
     # --- from the source's thread
@@ -141,7 +141,6 @@ class Recorder:
                     self._part.line(item)
             else:
                 self._write_block(item)
-                self._sync_if_due()
         except OSError as error:
             self._fail(f"{self._directory}: {error.strerror}: the recording ends here")
 

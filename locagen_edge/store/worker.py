@@ -1,27 +1,27 @@
 """A thread that writes, behind a bounded queue: a slow disk never holds up sound or event loop.
 
-What finds the queue full is dropped and counted: the newest, because what is older is already promised.
+It looks every `TURN_S`, or more often where that is asked for, and writes all that has come since: a thread
+that woke up for each item would cost more than what it does for it. What finds the queue full is dropped and
+counted: the newest, because what is older is already promised.
 """
 
 from __future__ import annotations
 
 import logging
-import queue
 import threading
+from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Generic, TypeVar
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-IDLE_S = 0.5
-"""how often `idle` is called while nothing comes"""
+TURN_S = 0.25
 
 
 class Worker(Generic[T]):
-    """Calls `write(item)` for each item, in order; `idle()` now and then; `end()` once, last. In one thread.
+    """In one thread: `write(item)` for each item in order, `turn()` after each turn, `end()` once, last.
 
     These three handle their own `OSError`. Any other exception is a fault of ours: told once, and all that
     comes afterwards is dropped.
@@ -32,49 +32,59 @@ class Worker(Generic[T]):
         name: str,
         most: int,
         write: Callable[[T], None],
-        idle: Callable[[], None],
+        turn: Callable[[], None],
         end: Callable[[], None],
+        turn_s: float = TURN_S,
     ) -> None:
         self.dropped = 0
         """items for which the queue had no room"""
         self.failure = ""
         """a fault of ours, in words"""
-        self._queue: queue.Queue[T | None] = queue.Queue(most)
-        self._write, self._idle, self._end = write, idle, end
-        self._closing = threading.Event()
+        self._most = most
+        self._queue: deque[T] = deque()
+        self._write, self._turn, self._end = write, turn, end
+        self._turn_s = min(turn_s, TURN_S)
+        self._lock = threading.Lock()
+        self._closing = False
+        self._wake = threading.Event()
         # a daemon thread: one that hangs in a disk must not keep the process from ending
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
+    @property
+    def waiting(self) -> int:
+        """Items in the queue."""
+        return len(self._queue)
+
     def put(self, item: T) -> bool:
         """From any thread, without waiting. False: dropped and counted."""
-        if not self._closing.is_set() and self._thread.is_alive():
-            try:
-                self._queue.put_nowait(item)
-                return True
-            except queue.Full:
-                pass
-        self.dropped += 1
-        return False
+        with self._lock:  # nothing comes in behind what `close` has promised to write
+            if self._closing or len(self._queue) >= self._most or not self._thread.is_alive():
+                self.dropped += 1
+                return False
+            self._queue.append(item)
+        if len(self._queue) > self._most // 2:
+            self._wake.set()
+        return True
 
     def close(self, timeout_s: float) -> bool:
         """Writes what is in the queue, then ends. False: the disk still hangs after so long."""
-        self._closing.set()
-        with suppress(queue.Full):  # then the thread is not waiting
-            self._queue.put_nowait(None)
+        with self._lock:
+            self._closing = True
+        self._wake.set()
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     def _run(self) -> None:
         try:
-            while not (self._closing.is_set() and self._queue.empty()):
-                try:
-                    item = self._queue.get(timeout=IDLE_S)
-                except queue.Empty:
-                    self._idle()
-                    continue
-                if item is not None:
-                    self._write(item)
+            while not self._closing:
+                self._wake.wait(self._turn_s)
+                self._wake.clear()
+                while self._queue:
+                    self._write(self._queue.popleft())
+                self._turn()
+            while self._queue:  # put just before `close`
+                self._write(self._queue.popleft())
             self._end()
         except Exception as error:
             self.failure = f"{self._thread.name}: {error!r}: nothing more is written"

@@ -15,7 +15,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 HERE = Path(__file__).parent
 ROWS = 65_521  # the ramp's period, a prime: it hides no repetition of blocks
@@ -33,13 +32,17 @@ def row_of(samples: np.ndarray, channel: int) -> np.ndarray:
     return (np.rint(np.asarray(samples) * 32768).astype(int) + ROWS // 2 - CHANNEL_STEP * channel) % ROWS
 
 
+class Missing(RuntimeError):
+    """Something of the machine's, in words."""
+
+
 def build(directory: Path) -> Path:
-    """The plugin, compiled. Skips the test where what it needs is not there."""
+    """The plugin, compiled. Raises `Missing` where what it needs is not there."""
     if ctypes.util.find_library("portaudio") is None:
-        pytest.skip("PortAudio is not installed (libportaudio2)")
+        raise Missing("PortAudio is not installed (libportaudio2)")
     compiler = shutil.which("cc")
     if compiler is None:
-        pytest.skip("no C compiler to build the virtual sound card with")
+        raise Missing("no C compiler to build the virtual sound card with")
     library = directory / "libasound_module_pcm_virtual.so"
     flags = ["-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-DPIC", "-shared"]
     headers = "#include <alsa/asoundlib.h>\n#include <alsa/pcm_external.h>\n"
@@ -47,7 +50,7 @@ def build(directory: Path) -> Path:
         [compiler, "-E", "-x", "c", "-"], input=headers, text=True, capture_output=True, check=False
     )
     if probe.returncode:
-        pytest.skip("ALSA's headers are not installed (libasound2-dev)")
+        raise Missing("ALSA's headers are not installed (libasound2-dev)")
     subprocess.run([compiler, *flags, "-o", library, HERE / "pcm_virtual.c", "-lasound"], check=True)
     return library
 

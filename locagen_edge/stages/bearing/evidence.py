@@ -24,7 +24,7 @@ YOUNG, YOUNG_S = 600.0, 1.6
 """The average counts as at least so much while the noise has just been learnt, of a matrix from few frames;
 falls by e in each of these times."""
 MEMORY_S = 20.0
-LOUDEST = 3.0
+LOUDEST = 5.0
 """The average takes no more than so many times its level at once: a call that was not recognised."""
 CLIP = 60.0
 """A frame's score counts up to here, so that one clap does not outweigh a second of voice."""
@@ -41,8 +41,8 @@ RISE_S = 0.08
 
 
 class Usual:
-    """What the best score of noise alone is, on average: at first of late, for rotors that hunt show it within
-    seconds; then of `MEMORY_S`."""
+    """What the best score of noise alone is, on average: at first of late, for rotors that hunt show it soon;
+    then of `MEMORY_S`."""
 
     def __init__(self) -> None:
         self._average, self._frames = 0.0, 0
@@ -66,12 +66,17 @@ class Usual:
         """The same without what the noise counts as for being hardly known yet."""
         return SCORE + self._average
 
-    def learn(self, score: float, elapsed_s: float) -> None:
-        most = LOUDEST * self.level
+    def age(self, elapsed_s: float) -> None:
+        """Time in which something called."""
         self._youth *= math.exp(-elapsed_s / YOUNG_S)
+
+    def learn(self, score: float, elapsed_s: float) -> None:
+        """A score of noise alone."""
+        most = LOUDEST * self.level
+        self.age(elapsed_s)
         self._frames += 1
-        # 2 / (n + 1): each score weighs as much as the number of those before it
-        share = max(1.0 - math.exp(-elapsed_s / MEMORY_S), 2.0 / (self._frames + 1))
+        # 3 / (n + 2): each score weighs about as the square of the number of those before it
+        share = max(1.0 - math.exp(-elapsed_s / MEMORY_S), 3.0 / (self._frames + 2))
         self._average += share * (min(score, most) - self._average)
 
 

@@ -340,8 +340,10 @@ class SteeredLocator:
             if quiet and self._quiet_hops % self._lag == 0:
                 self._search.settle(1.0 - math.exp(-self._hop_s / WATCH_S), span)
         for usual, score in zip(self._usual, self._scores, strict=True):
-            if score is not None:
+            if score is not None and not call and usual.ratio(score) < self._least_ratio:
                 usual.learn(score, self._elapsed_s)
+            else:
+                usual.age(self._elapsed_s)
         if not self._usual[0].young and max(self._since_lag) < self._least_ratio:
             self._onsets.learn(self._lag, self._elapsed_s)
 
