@@ -71,8 +71,7 @@ def make(folder: Path, settings: LabSettings, workers: int = 1, scheduler: str =
     except OSError as error:
         raise DatasetError(f"{folder}: cannot be made: {error.strerror}") from error
     with _alone(folder):
-        for leftover in folder.glob(f".*{TEMPORARY}"):
-            leftover.unlink(missing_ok=True)
+        _sweep(folder)
         kept = complete(folder, settings)
         todo = [number for number in range(shard_count(settings)) if number not in kept]
         run = _on_cluster(scheduler) if scheduler else _here(workers)
@@ -82,6 +81,7 @@ def make(folder: Path, settings: LabSettings, workers: int = 1, scheduler: str =
                 if number not in done:
                     bar.update(shard_samples(settings, number))
                 done.add(number)
+        _sweep(folder)  # of workers that were lost on the way
         missing = set(todo) - complete(folder, settings)
         if missing:
             raise DatasetError(
@@ -89,6 +89,12 @@ def make(folder: Path, settings: LabSettings, workers: int = 1, scheduler: str =
                 "the folder has to be on a file system that all workers share"
             )
     return Made(shard_count(settings), len(kept))
+
+
+def _sweep(folder: Path) -> None:
+    """Removes what was never finished."""
+    for leftover in folder.glob(f".*{TEMPORARY}"):
+        leftover.unlink(missing_ok=True)
 
 
 def complete(folder: Path, settings: LabSettings) -> set[int]:
