@@ -67,6 +67,7 @@ CHAINS: dict[str, dict[str, Any]] = {
 }
 GOALS: dict[str, dict[str, float]] = {
     "paper": {"cpu_percent": 1.0, "pss_mib": 75.0, "first_bearing_s": 1.5},
+    "steered": {"first_bearing_s": 1.5},
     "mask": {"cpu_percent": 4.0, "pss_mib": 75.0},
 }
 DELAY_GOAL_MS = {"median": 2.0, "p99": 5.0}
