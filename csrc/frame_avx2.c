@@ -16,7 +16,7 @@ int locagen_frame_avx2(const state *s, const float *in, float *correlation, floa
 }
 
 const locagen_steer_paths locagen_steer_avx2 = {
-    WIDTH, listen, add_frame, add_squares, blend, invert_band, whiten_band, score_groups,
+    WIDTH, listen, add_frame, add_squares, blend, soothe, invert_band, whiten_band, score_groups, place_groups,
 };
 #if defined(__clang__)
 #pragma clang attribute pop

@@ -8,4 +8,6 @@ int locagen_frame_quad(const state *s, const float *in, float *correlation, floa
     return frame_path(s, in, correlation, power);
 }
 
-const locagen_steer_paths locagen_steer_quad = {WIDTH, listen, add_frame, add_squares, blend, invert_band, whiten_band, score_groups};
+const locagen_steer_paths locagen_steer_quad = {
+    WIDTH, listen, add_frame, add_squares, blend, soothe, invert_band, whiten_band, score_groups, place_groups,
+};

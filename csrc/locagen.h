@@ -115,7 +115,7 @@ typedef struct {
     int32_t frame;         /* samples per microphone and frame */
     int32_t hop;           /* samples from frame to frame, 0: no overlap; only to count what frames are worth */
     int32_t spans;         /* averages R_x side by side, each with a memory of its own: 1 to 4 */
-    int32_t lag;           /* learn takes the frame of so many listens ago: a call is known only after a while */
+    int32_t lag;           /* learn can take a frame of so many listens ago: a call is known only after a while */
     int32_t smooth_bins;   /* bins each side over which q is averaged: the source's spectrum is smooth there */
     int32_t azimuths;      /* coarse grid: azimuths of the full circle, the first at 0 */
     int32_t elevations;    /* rows, at half steps: over the lower half for a flat array, else the whole sphere */
@@ -175,10 +175,10 @@ int locagen_steer_reset(locagen_steer *state);
  * stand in a line, and all of them do not, there is none. */
 int locagen_steer_listen(locagen_steer *state, const float *in, float *power);
 
-/* R_n <- (1 - share) R_n + share x x^H with the bins of the frame `lag` before the last, while nothing calls;
- * nothing where so many have not been. The start is corrected for: after the first call R_n is x x^H, whatever
- * the share. */
-int locagen_steer_learn(locagen_steer *state, float share);
+/* R_n <- (1 - share) R_n + share x x^H with the bins of the frame `ago` before the last (0: the last; at most
+ * `lag`), while nothing calls; nothing where so many have not been. The start is corrected for: after the first
+ * call R_n is x x^H, whatever the share. */
+int locagen_steer_learn(locagen_steer *state, int32_t ago, float share);
 
 /* The same for the R_x of one span, with the last frame. share 1: this frame alone. */
 int locagen_steer_hear(locagen_steer *state, int32_t span, float share);
@@ -187,9 +187,12 @@ int locagen_steer_hear(locagen_steer *state, int32_t span, float share);
  * is looked for, and at last the directions of those that are clearly more than noise are refined, each with
  * the others nulled. Returns how many `out` holds: none before hear, in silence or with less than two
  * microphones; at most one less than there are microphones; none that scores `least` or less, and where
- * nothing does on the grid nothing is refined, which saves half of the time. A state that never learnt takes the noise for
- * white, and its level from what R_x holds across its best direction (M - 1 of M dimensions). */
-int locagen_steer_search(locagen_steer *state, int32_t span, int32_t most, float least, locagen_source *out);
+ * nothing does on the grid nothing is refined, which saves half of the time. With `further` above 0 a further
+ * source has to score more than that, and more than what a null may leave of the first. A state that never learnt
+ * takes the noise for white, and its level from what R_x holds across its best direction (M - 1 of M
+ * dimensions). */
+int locagen_steer_search(locagen_steer *state, int32_t span, int32_t most, float least, float further,
+                         locagen_source *out);
 
 /* Puts aside how far q strayed from 1 in the last search, in each direction of the grid and each part of the
  * band; while nothing calls. */

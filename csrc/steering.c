@@ -27,7 +27,10 @@ static const double THIN_PHASE = 0.15;
  * last as narrow as float's rounding of the scores allows. */
 static const double WIDTHS[] = {0.6, 0.4, 0.2, 0.2};
 
+static const double STILL = 0.02; /* radians of phase: after so short a step the next is about its square */
+
 static const double LOBE = 3.0;  /* radians of phase from a lobe's top to beyond its foot */
+static const double FAINT = 0.05; /* of the first source's score: what an inexact null may leave of it */
 static const float CLOSE = 0.9f; /* the grid costs a lobe less than a tenth of its score */
 
 static const double SMEAR_HZ = 100;      /* each side: what a rotor's tones wander in some seconds at 4 kHz */
@@ -54,12 +57,6 @@ static steer *state_of(const void *memory)
 static int within(double x, double low, double high)
 {
     return x >= low && x <= high;
-}
-
-/* Groups of directions in the grid. */
-static int groups_of(const steer *s)
-{
-    return (s->azimuths * s->elevations + DIRECTIONS - 1) / DIRECTIONS;
 }
 
 static double dot(const double a[3], const double b[3])
@@ -181,6 +178,7 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
     s->stride = (s->bins + BIN_BLOCK - 1) / BIN_BLOCK * BIN_BLOCK;
     s->loading = c->loading, s->floor = c->floor;
     s->azimuths = c->azimuths, s->elevations = c->elevations;
+    s->groups = (c->azimuths * c->elevations + DIRECTIONS - 1) / DIRECTIONS;
     s->spans = c->spans, s->lag = c->lag;
     s->smear = c->smear, s->smear_half = (int32_t)(SMEAR_HZ * c->frame / c->rate_hz);
     find_plane(s, c);
@@ -216,10 +214,10 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
     double blocks = (2 * c->smooth_bins + 1) / (double)thinning;
     lay_out_response(&s->coarse, s, s->bins / thinning, (int)floor((blocks - 1) / 2 + 0.5), thinning, a);
     s->nulls = locagen_take(a, 2 * (mics - 1) * mics * (size_t)s->stride);
-    size_t groups = (size_t)groups_of(s);
+    size_t groups = (size_t)s->groups;
     s->grid = locagen_take(a, groups * (mics - 1) * 4 * DIRECTIONS);
     s->aim = locagen_take(a, (mics - 1) * 4 * DIRECTIONS);
-    s->scores = locagen_take(a, 2 * groups * DIRECTIONS);
+    s->scores = locagen_take(a, groups * DIRECTIONS);
     s->careful = locagen_take(a, groups * DIRECTIONS);
     s->q = locagen_take(a, (size_t)s->bins * DIRECTIONS);
     for (int n = 0; n < s->spans; n++) {
@@ -228,6 +226,7 @@ static void lay_out(steer *s, const locagen_steer_config *c, locagen_arena *a)
         span->scores = locagen_take(a, groups * DIRECTIONS);
         span->over = locagen_take(a, groups * DIRECTIONS * (size_t)s->coarse.bins);
         span->spread = locagen_take(a, groups * DIRECTIONS * (size_t)s->coarse.bins);
+        span->calm = locagen_take(a, groups * DIRECTIONS * (size_t)s->coarse.bins);
         for (int i = 0; i < 2; i++)
             span->aside[i] = locagen_take(a, groups * DIRECTIONS * (size_t)s->coarse.bins);
     }
@@ -269,7 +268,7 @@ static void fill_grid(steer *s)
 {
     int count = s->azimuths * s->elevations;
     double thinning = s->coarse.thinning;
-    for (int n = 0; n < groups_of(s) * DIRECTIONS; n++) {
+    for (int n = 0; n < s->groups * DIRECTIONS; n++) {
         int at = n < count ? n : count - 1;
         double elevation = grid_elevation(s, at / s->azimuths), azimuth = grid_azimuth(s, at % s->azimuths);
         double *u = s->grid_u + 3 * n;
@@ -343,7 +342,7 @@ int locagen_steer_reset(locagen_steer *memory)
         return LOCAGEN_E_NULL;
     steer *s = state_of(memory);
     size_t row = (size_t)s->stride * sizeof(float), mics = (size_t)s->mics;
-    size_t groups = (size_t)groups_of(s) * DIRECTIONS * sizeof(float), blocks = groups * (size_t)s->coarse.bins;
+    size_t groups = (size_t)s->groups * DIRECTIONS * sizeof(float), blocks = groups * (size_t)s->coarse.bins;
     memset(s->bins_re, 0, ((size_t)s->lag + 1) * mics * row);
     memset(s->bins_im, 0, ((size_t)s->lag + 1) * mics * row);
     memset(s->noise, 0, mics * mics * row);
@@ -400,17 +399,18 @@ static void add(const steer *s, int slot, float share, float *matrix, float *los
     weights[0] = fresh;
 }
 
-int locagen_steer_learn(locagen_steer *memory, float share)
+int locagen_steer_learn(locagen_steer *memory, int32_t ago, float share)
 {
     if (memory == NULL)
         return LOCAGEN_E_NULL;
     if (!within(share, 0, 1))
         return LOCAGEN_E_SHARE;
     steer *s = state_of(memory);
-    if (s->listened <= s->lag)
+    if (ago < 0 || ago > s->lag)
+        return LOCAGEN_E_LAG;
+    if (s->listened <= ago)
         return LOCAGEN_OK;
-    int oldest = (s->slot + 1) % (s->lag + 1);
-    add(s, oldest, share, s->noise, s->lost_noise, &s->learnt, &s->learnt_variance, s->learnt_weights);
+    add(s, (s->slot + s->lag + 1 - ago) % (s->lag + 1), share, s->noise, s->lost_noise, &s->learnt, &s->learnt_variance, s->learnt_weights);
     s->inverse_mics = 0;
     return LOCAGEN_OK;
 }
@@ -518,17 +518,13 @@ static double prior_of(const steer *s, const locagen_span *x)
     return PRIOR_LOOKS / fresh * WATCH_SHARE;
 }
 
-/* How far q has spread, against theory's 1 / (looks * bins averaged), as a rate and an offset that theory
- * adds to what was watched: see locagen_spread. */
+/* How far q has spread, against theory's 1 / (looks * bins averaged). */
 static locagen_spread spread_of(const steer *s, locagen_span *x)
 {
     locagen_spread spread = {.over = x->over, .seen = x->over, .careful = x->scores};
     if (x->watched <= 0 || s->learnt <= 0)
         return spread;
-    double prior = prior_of(s, x), total = x->watched + prior;
-    spread.spread = x->spread;
-    spread.rate = (float)(1 / total);
-    spread.offset = (float)(prior / total);
+    spread.calm = x->calm;
     spread.theory = (float)(1 / (looks(s, x) * averaged(s)));
     return spread;
 }
@@ -544,7 +540,7 @@ static float over_theory(const steer *s, const locagen_span *x)
 /* Numbers in `over` and all that is made of it. */
 static long spread_count(const steer *s)
 {
-    return groups_of(s) * (long)DIRECTIONS * s->coarse.bins;
+    return s->groups * (long)DIRECTIONS * s->coarse.bins;
 }
 
 int locagen_steer_watch(locagen_steer *memory, int32_t span)
@@ -575,6 +571,8 @@ int locagen_steer_settle(locagen_steer *memory, int32_t span, float share)
         double keep = pow(1 - (double)share, x->aside_count[1]);
         s->paths->blend(spread_count(s), (float)keep, (float)((1 - keep) / x->aside_count[1]), done, x->spread);
         x->watched = keep * x->watched + 1 - keep;
+        double prior = prior_of(s, x);
+        s->paths->soothe(spread_count(s), (float)prior, (float)(x->watched + prior), x->spread, x->calm);
         memset(done, 0, (size_t)spread_count(s) * sizeof *done);
     }
     x->aside[1] = x->aside[0], x->aside_count[1] = x->aside_count[0];
@@ -615,37 +613,49 @@ static long place_in_spread(const steer *s, int n)
     return (long)(n / width) * s->coarse.bins * width + n % width;
 }
 
-/* By how much coarse bin k has strayed before in a direction of the grid, over theory. */
-static double wildness(const steer *s, const locagen_spread *spread, int n, int k)
+/* How calm coarse bin k has been before in a direction of the grid. */
+static float calmness(const steer *s, const locagen_spread *spread, int n, int k)
 {
-    if (spread->spread == NULL)
-        return 1;
-    float watched = spread->spread[place_in_spread(s, n) + (long)k * s->paths->width];
-    return fmax(1, (double)(spread->rate * watched + spread->offset));
+    return spread->calm ? spread->calm[place_in_spread(s, n) + (long)k * s->paths->width] : 1.0f;
 }
 
 /* What its looks count for where a source is to be placed that gave these q. */
-static double trust(const steer *s, const locagen_spread *spread, int n, int k)
+static float trust(const steer *s, const locagen_spread *spread, int n, int k)
 {
-    double wild = wildness(s, spread, n, k), theory = (double)spread->theory, reach = REACH * REACH * theory;
-    double over = spread->seen ? (double)spread->seen[place_in_spread(s, n) + (long)k * s->paths->width] : 0;
-    return wild > 1 ? (over * over + reach) / (over * over * (1 + (wild - 1) * theory) + wild * reach) : 1;
+    if (spread->calm == NULL)
+        return 1;
+    float calm = calmness(s, spread, n, k), theory = spread->theory, reach = REACH * REACH * theory;
+    float over = spread->seen[place_in_spread(s, n) + (long)k * s->paths->width], x = over * over;
+    return calm * (x + reach) / (x * (calm + (1.0f - calm) * theory) + reach);
 }
 
 /* Looks of all bins, in the direction of the grid that a refinement begins with. */
 static void count_fine_bins(const steer *s, const locagen_spread *spread, double t, int n)
 {
-    for (int k = 0; k < s->bins; k++) {
-        int block = k / s->coarse.thinning;
-        block = block < s->coarse.bins ? block : s->coarse.bins - 1;
-        s->fine.looks[k] = (float)(t * trust(s, spread, n, block)) * s->mask[k];
+    int step = s->coarse.thinning;
+    for (int block = 0, k = 0; block < s->coarse.bins; block++) {
+        float looks = (float)t * trust(s, spread, n, block);
+        int end = block < s->coarse.bins - 1 ? k + step : s->bins; /* the last counts for what is left over */
+        for (; k < end; k++)
+            s->fine.looks[k] = looks * s->mask[k];
     }
 }
 
-static void score_grid(const steer *s, enum locagen_measure measure, const locagen_spread *spread)
+/* Scores of the grid. Returns 0, and leaves those that place a source undone, where none would be `least`,
+ * carefully: in noise alone, mostly. */
+static int score_grid(const steer *s, enum locagen_measure measure, const locagen_spread *spread, float least)
 {
-    float *mean_q = s->scores + (long)groups_of(s) * DIRECTIONS; /* nobody reads it */
-    s->paths->score(s, &s->coarse, measure, spread, s->grid, groups_of(s), s->scores, mean_q);
+    int later = spread->over && spread->calm && measure == MEASURE_RATIO;
+    s->paths->score(s, &s->coarse, measure, spread, s->grid, s->groups, later ? NULL : s->scores, NULL);
+    if (!later)
+        return 1;
+    float most = 0;
+    for (int n = 0; n < s->azimuths * s->elevations; n++)
+        most = spread->careful[n] > most ? spread->careful[n] : most;
+    if (!(most > least))
+        return 0;
+    s->paths->place(s, spread, s->scores);
+    return 1;
 }
 
 /* Whether the lobe of one direction may hold the other. */
@@ -687,6 +697,7 @@ typedef struct {
     double u[3], score, mean_q;
     double careful;      /* score */
     double rival;        /* score in the best other lobe, over this */
+    double moved;        /* in the last step, radians of phase */
     double along[2][3];  /* the coordinates' axes */
     double hessian[3];   /* xx, xy, yy */
 } aim;
@@ -777,6 +788,7 @@ static int refine_once(const steer *s, enum locagen_measure measure, double h, a
     } else {
         moved(s, a, step[0], step[1], a->u);
     }
+    a->moved = s->reach * hypot(step[0], step[1]);
     double gain = g[0] * step[0] + g[1] * step[1] +
                   0.5 * (m[0] * step[0] * step[0] + 2 * m[1] * step[0] * step[1] + m[2] * step[1] * step[1]);
     a->score = f[0] + fmax(gain, -0.5 * fabs(f[0]));
@@ -786,9 +798,12 @@ static int refine_once(const steer *s, enum locagen_measure measure, double h, a
 
 static void refine(const steer *s, enum locagen_measure measure, aim *a)
 {
-    int left = MOST_STEPS;
-    for (size_t n = 0; n < sizeof WIDTHS / sizeof *WIDTHS && left > 0; left--)
+    int left = MOST_STEPS, last = sizeof WIDTHS / sizeof *WIDTHS - 1;
+    for (int n = 0; n <= last && left > 0; left--) {
         n += !refine_once(s, measure, WIDTHS[n] / s->reach, a);
+        if (n == last && a->moved < STILL)
+            return;
+    }
 }
 
 /* The best direction of all, and what the best in another lobe scores over it. The grid may put lobes in a wrong
@@ -800,7 +815,8 @@ static int find_best(const steer *s, enum locagen_measure measure, const locagen
     const float *scores = s->scores, *careful = spread->careful ? spread->careful : scores;
     int top[MOST_LOBES], lobes = 0;
     double second = 0;
-    score_grid(s, measure, spread);
+    if (!score_grid(s, measure, spread, CLOSE * least))
+        return 0;
     for (; lobes < MOST_LOBES; lobes++) {
         int at = top[lobes] = next_on_grid(s, scores, top, lobes);
         if (at < 0 || !(scores[at] > 0))
@@ -880,9 +896,28 @@ static double contrast(const steer *s, const locagen_spread *spread, int n, int 
         for (int i = first; i <= last; i++)
             p += (double)power[i];
         p = fmax(0, p / (r->thinning * (last - first + 1.0)) - 1);
-        sum += (double)r->looks[k] / wildness(s, spread, n, k) * (q - log1p(q) - mics * (p - log1p(p)));
+        sum += (double)(r->looks[k] * calmness(s, spread, n, k)) * (q - log1p(q) - mics * (p - log1p(p)));
     }
     return sum;
+}
+
+/* By how much the noise turns a direction of the grid more than theory knows, as variance: where q strayed wild
+ * times as far as it should have, noise beside noise, of 1 in q, pulls wild times as hard; source beside noise,
+ * q - 1, as ever. Each part of the band counts by its share of the information, f^2 (q - 1)^2 / q. */
+static double unrest(const steer *s, const locagen_spread *spread, int n)
+{
+    const locagen_response *r = &s->coarse;
+    double known = 0, pulled = 0;
+    if (spread->calm == NULL)
+        return 1;
+    for (int k = 0; k < r->bins; k++) {
+        double over = (double)spread->seen[place_in_spread(s, n) + (long)k * s->paths->width];
+        double f = s->spectrum.first_bin + (k + 0.5) * r->thinning, wild = 1 / (double)calmness(s, spread, n, k);
+        double information = (double)(r->looks[k] * trust(s, spread, n, k)) * f * f * over * over / (1 + over);
+        known += information;
+        pulled += information * (over + wild) / (over + 1);
+    }
+    return known > 0 ? pulled / known : 1;
 }
 
 static void add_null(steer *s, int source, const double u[3])
@@ -899,7 +934,7 @@ static void add_null(steer *s, int source, const double u[3])
     }
 }
 
-static locagen_source told(const aim *a, int mics)
+static locagen_source told(const aim *a, int mics, double unrest)
 {
     double azimuth[3], elevation[3];
     arcs(a->u, azimuth, elevation);
@@ -916,7 +951,7 @@ static locagen_source told(const aim *a, int mics)
         .elevation_rad = (float)atan2(-a->u[2], level),
         .score = (float)a->score,
         .snr = (float)fmax(0, (a->mean_q - 1) / __builtin_popcount((unsigned)mics)),
-        .information = {(float)-xx, (float)-xy, (float)-yy},
+        .information = {(float)(-xx / unrest), (float)(-xy / unrest), (float)(-yy / unrest)},
     };
 }
 
@@ -925,7 +960,7 @@ static locagen_source told(const aim *a, int mics)
  * holds no source would cost the others many degrees (measured: up to 16). */
 static int is_sure(const steer *s, const aim *aims, const double *score, int n)
 {
-    int sure = score[n] > 4.0 * s->bins / (2 * s->fine.half + 1) && score[n] > 0.05 * score[0];
+    int sure = score[n] > 4.0 * s->bins / (2 * s->fine.half + 1) && score[n] > FAINT * score[0];
     for (int before = 0; before < n; before++)
         sure &= !same_lobe(s, aims[n].u, aims[before].u);
     return sure;
@@ -948,13 +983,14 @@ static void relax(steer *s, locagen_whitening how, const locagen_spread *spread,
     }
 }
 
-int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, float least, locagen_source *out)
+int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, float least, float further,
+                         locagen_source *out)
 {
     if (memory == NULL || out == NULL)
         return LOCAGEN_E_NULL;
     if (most < 1)
         return LOCAGEN_E_COUNT;
-    if (!within((double)least, 0, (double)FLT_MAX))
+    if (!within((double)least, 0, (double)FLT_MAX) || !within((double)further, 0, (double)FLT_MAX))
         return LOCAGEN_E_LEAST;
     steer *s;
     locagen_span *x;
@@ -962,8 +998,8 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
     if (error != LOCAGEN_OK)
         return error;
     if (usable_mics(s, x) == 0) {
-        memset(x->scores, 0, (size_t)groups_of(s) * DIRECTIONS * sizeof *x->scores);
-        memset(x->over, 0, (size_t)groups_of(s) * DIRECTIONS * (size_t)s->coarse.bins * sizeof *x->over);
+        memset(x->scores, 0, (size_t)s->groups * DIRECTIONS * sizeof *x->scores);
+        memset(x->over, 0, (size_t)s->groups * DIRECTIONS * (size_t)s->coarse.bins * sizeof *x->over);
         return 0;
     }
     locagen_whitening how = whitening(s, x);
@@ -974,6 +1010,11 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
     count_coarse_bins(s, t);
     for (; found < most && found < count - 1; found++, how.nulls++) {
         aim *a = &aims[found];
+        if (found > 0 && further > 0) {
+            if (!(score[found - 1] > (double)further))
+                break; /* what comes next is weaker still */
+            least = (float)fmax((double)further, FAINT * score[0]);
+        }
         s->paths->whiten(s, &how);
         if (!find_best(s, MEASURE_RATIO, &spread, t, least, a))
             break;
@@ -991,7 +1032,7 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
         relax(s, how, &spread, t, sure, aims);
     for (int n = 0; n < found; n++) {
         aims[n].score = score[n], aims[n].mean_q = mean_q[n];
-        out[n] = told(&aims[n], how.mics);
+        out[n] = told(&aims[n], how.mics, unrest(s, &spread, aims[n].at));
         out[n].contrast = (float)first;
         out[n].rival = n == 0 ? (float)aims[0].rival : 0.0f;
     }

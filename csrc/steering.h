@@ -36,8 +36,9 @@ typedef struct {
     float lost[MOST_MICS];      /* of heard, what lacks this microphone */
     float *signal;              /* R_x times the sum of its weights */
     float *scores;              /* careful ones of the grid, in the last search */
-    float *over, *spread;       /* [vector of directions][coarse bin][lane]: q - 1 where above 0, in the last
-                                 * search; its mean square over theory's, times the sum of the weights */
+    float *over, *spread, *calm; /* [vector of directions][coarse bin][lane]: q - 1 where above 0, in the last
+                                 * search; its mean square over theory's, times the sum of the weights; what that
+                                 * comes to (locagen_spread), made anew where the spread is */
     float *aside[2];            /* sums of such squares, since settle and before */
     int32_t aside_count[2];
 } locagen_span;
@@ -49,6 +50,7 @@ typedef struct steer {
     locagen_spectrum spectrum;
     int32_t mics, pairs, bins, stride;
     int32_t elevations, azimuths, whole_sphere, flat;
+    int32_t groups;             /* of directions in the grid */
     float loading, floor;
     double axes[3][3];          /* in the array's plane: first and second axis, and its normal, downwards */
     double offset[MOST_MICS][3];/* p_m - p_0, as radians of phase per bin of frequency and unit of u */
@@ -94,15 +96,14 @@ typedef struct {
 
 enum locagen_measure { MEASURE_RATIO, MEASURE_POWER }; /* sum of g(q), or of q */
 
-/* Beside the scores of the grid: its q, and by how much each has spread before, over theory:
- * wild = max(1, rate * spread + offset). A careful score divides looks by it: whether there is a source. Where it
- * is, the score tells with nearly all looks of what is far beyond the noise's reach, less what noise takes
- * that is louder than R_n: as it was before, on average by theory * (wild - 1). */
+/* Beside the scores of the grid: its q, and how calm each was before: 1 / wild, wild = max(1, spread over theory).
+ * A careful score multiplies looks by it: whether there is a source. Where it is, the score tells with nearly all
+ * looks of what is far beyond the noise's reach, less what noise takes that is louder than R_n: as it was
+ * before, on average by theory * (wild - 1). */
 typedef struct {
     float *over, *careful;      /* where to put q - 1 and careful scores; null: nowhere */
     const float *seen;          /* q - 1 of the grid before any null */
-    const float *spread;        /* null: as theory says */
-    float rate, offset;
+    const float *calm;          /* null: as theory says */
     float theory;               /* mean (q - 1)^2 of noise as theory has it */
 } locagen_spread;
 
@@ -112,11 +113,13 @@ typedef struct locagen_steer_paths {
     void (*add)(const steer *s, int32_t slot, float keep, float share, float *matrix);
     void (*add_squares)(long count, float scale, float most, const float *over, float *sum);
     void (*blend)(long count, float keep, float share, const float *from, float *to);
+    void (*soothe)(long count, float prior, float total, const float *spread, float *calm);
     void (*invert)(const steer *s, const locagen_whitening *how);
     void (*whiten)(const steer *s, const locagen_whitening *how);
     void (*score)(const steer *s, const locagen_response *r, enum locagen_measure measure,
                   const locagen_spread *spread, const float *phases, int32_t groups, float *score,
                   float *mean_q);
+    void (*place)(const steer *s, const locagen_spread *spread, float *score);
 } locagen_steer_paths;
 
 extern const locagen_steer_paths locagen_steer_quad;

@@ -84,13 +84,19 @@ INLINE vec logarithm(vec x)
     return exponent * 0.69314718f + 2.0f * t * (1.0f + s * (1.0f / 3 + s * (1.0f / 5 + s * (1.0f / 7))));
 }
 
+/* The share of a part's looks that tells where a source is. */
+INLINE vec trusted(vec over, vec calm, float theory)
+{
+    vec x = over * over, reach = all(REACH * REACH * theory);
+    return calm * (x + reach) / (x * (calm + (1.0f - calm) * theory) + reach);
+}
+
 /* From q at every bin to the scores: the average over neighbours as a running sum, g, the sum over bins.
- * `at`: where in the spread the directions' own begins. */
+ * `at`: where in the spread the directions' own begins. Without `score` only the careful ones are made. */
 STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const locagen_spread *spread,
                  long at, const float *q, float *score, float *mean_q)
 {
     const vec one = all(1.0f), most = all(1e9f); /* 90 dB: its square is finite */
-    const vec reach = all(REACH * REACH * spread->theory);
     long bins = r->bins, half = r->half;
     vec plain = all(0.0f), sum = all(0.0f), careful = all(0.0f), window = all(0.0f);
     for (long k = 0; k < half; k++)
@@ -107,18 +113,32 @@ STEP void sum_up(const locagen_response *r, enum locagen_measure measure, const 
         if (spread->over)
             store(spread->over + at + k * WIDTH, -larger(-over, -most));
         vec gain = r->looks[k] * (over - logarithm(one + over));
-        if (spread->spread) {
-            vec wild = larger(spread->rate * load(spread->spread + at + k * WIDTH) + spread->offset, one);
-            careful += gain / wild;
-            vec x = over * over, louder = one + (wild - one) * spread->theory;
-            gain *= (x + reach) / (x * louder + wild * reach);
+        if (spread->calm) {
+            vec calm = load(spread->calm + at + k * WIDTH);
+            careful += gain * calm;
+            if (score)
+                gain *= trusted(over, calm, spread->theory);
         }
         sum += gain;
     }
-    store(score, measure == MEASURE_POWER ? plain : sum);
+    if (score)
+        store(score, measure == MEASURE_POWER ? plain : sum);
     if (spread->careful)
-        store(spread->careful + at / bins, spread->spread ? careful : sum);
-    store(mean_q, plain * (1.0f / (float)bins));
+        store(spread->careful + at / bins, spread->calm ? careful : sum);
+    if (mean_q)
+        store(mean_q, plain * (1.0f / (float)bins));
+}
+
+/* The scores that sum_up was spared, from the q that it left. */
+STEP void sum_up_later(const locagen_response *r, const locagen_spread *spread, long at, float *score)
+{
+    vec sum = all(0.0f);
+    for (long k = 0; k < r->bins; k++, at += WIDTH) {
+        vec over = load(spread->seen + at);
+        vec gain = r->looks[k] * (over - logarithm(all(1.0f) + over));
+        sum += gain * trusted(over, load(spread->calm + at), spread->theory);
+    }
+    store(score, sum);
 }
 
 /* to <- keep to + share from */
@@ -126,6 +146,13 @@ STEP void blend(long count, float keep, float share, const float *from, float *t
 {
     for (long n = 0; n < count; n += WIDTH)
         store(to + n, keep * load(to + n) + share * load(from + n));
+}
+
+/* calm <- 1 / max(1, (spread + prior) / total) */
+STEP void soothe(long count, float prior, float total, const float *spread, float *calm)
+{
+    for (long n = 0; n < count; n += WIDTH)
+        store(calm + n, total / larger(load(spread + n) + prior, all(total)));
 }
 
 STEP void add_squares(long count, float scale, float most, const float *over, float *sum)
@@ -142,11 +169,20 @@ static void score_groups(const steer *s, const locagen_response *r, enum locagen
 {
     long at = 0;
     for (int32_t group = 0; group < groups; group++, phases += 4 * DIRECTIONS * (s->mics - 1))
-        for (int lane = 0; lane < DIRECTIONS; lane += WIDTH, score += WIDTH, mean_q += WIDTH) {
+        for (int lane = 0; lane < DIRECTIONS; lane += WIDTH) {
             RESPONSES_OF[s->mics](r, phases + lane, s->q);
             sum_up(r, measure, spread, at, s->q, score, mean_q);
             at += (long)r->bins * WIDTH;
+            score = score ? score + WIDTH : score;
+            mean_q = mean_q ? mean_q + WIDTH : mean_q;
         }
+}
+
+static void place_groups(const steer *s, const locagen_spread *spread, float *score)
+{
+    long step = (long)s->coarse.bins * WIDTH, all = s->groups * (long)DIRECTIONS / WIDTH;
+    for (long n = 0; n < all; n++)
+        sum_up_later(&s->coarse, spread, n * step, score + n * WIDTH);
 }
 
 #endif

@@ -419,7 +419,7 @@ static void learn_hiss(const steer_bench *b, int frames)
         be_silent(b);
         add_hiss(b, 0.1f);
         CHECK(locagen_steer_listen(b->kernel, b->in, b->power) == 0, "hiss is finite");
-        CHECK(locagen_steer_learn(b->kernel, 1.0f / (float)(n + 1)) == 0, "learnt");
+        CHECK(locagen_steer_learn(b->kernel, 0, 1.0f / (float)(n + 1)) == 0, "learnt");
     }
 }
 
@@ -469,7 +469,7 @@ static void test_steered_angles(const locagen_steer_paths *chosen)
                 add_hiss(&b, 0.1f);
                 CHECK(locagen_steer_listen(b.kernel, b.in, b.power) == 0, "finite");
                 locagen_steer_hear(b.kernel, 0, 1.0f);
-                int found = locagen_steer_search(b.kernel, 0, config.mics, 0, b.sources);
+                int found = locagen_steer_search(b.kernel, 0, config.mics, 0, 0, b.sources);
                 CHECK(found >= 1 && found < config.mics, "case %zu: %d sources", n, found);
                 /* 10 dB and more: under a degree, a few where the band is narrow. */
                 double error = off_by(b.sources, azimuth, elevation);
@@ -502,7 +502,7 @@ static void test_steered_poles(const locagen_steer_paths *chosen)
             add_wave(&b, 0.3, pole ? -1.5707963267948966 : 0.0, 0.1f);
             locagen_steer_listen(b.kernel, b.in, b.power);
             locagen_steer_hear(b.kernel, 0, 1.0f);
-            int found = locagen_steer_search(b.kernel, 0, 1, 0, b.sources);
+            int found = locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources);
             CHECK(found == 1 && all_finite(b.sources), "%d mics, pole %d: %d", mics, pole, found);
             double error = off_by(b.sources, 0.3, pole ? -1.5707963267948966 : 0.0);
             CHECK(mics == 2 || error < 2, "%d mics, pole %d: %.2f degrees", mics, pole, error);
@@ -529,9 +529,9 @@ static void test_steered_faults(const locagen_steer_paths *chosen)
                 int bad = locagen_steer_listen(b.kernel, b.in, b.power);
                 CHECK(bad == (faults[fault] == 0.0f ? 0 : 1 << faulty), "%d mics, fault %zu: %d", mics, fault, bad);
                 CHECK(b.power[faulty] == 0.0f, "power %g", (double)b.power[faulty]);
-                frame < 3 ? locagen_steer_learn(b.kernel, 0.5f) : locagen_steer_hear(b.kernel, 0, 0.5f);
+                frame < 3 ? locagen_steer_learn(b.kernel, 0, 0.5f) : locagen_steer_hear(b.kernel, 0, 0.5f);
             }
-            int found = locagen_steer_search(b.kernel, 0, 8, 0, b.sources);
+            int found = locagen_steer_search(b.kernel, 0, 8, 0, 0, b.sources);
             CHECK(found < mics && (found > 0) == (mics > 2), "%d mics, fault %zu: %d found", mics, fault, found);
             for (int source = 0; source < found; source++)
                 CHECK(all_finite(&b.sources[source]), "%d mics, fault %zu", mics, fault);
@@ -541,7 +541,7 @@ static void test_steered_faults(const locagen_steer_paths *chosen)
         }
 }
 
-/* What is learnt is the frame `lag` hops ago, of the ring's every turn; the largest lag of all in bounds. */
+/* What is learnt is the frame so many hops ago, of the ring's every turn; the largest lag of all in bounds. */
 static void test_steered_lag(const locagen_steer_paths *chosen)
 {
     for (int lag = 0; lag <= MOST_LAG; lag += 1 + lag) {
@@ -552,17 +552,22 @@ static void test_steered_lag(const locagen_steer_paths *chosen)
         float *noise = malloc(sizeof(float) * (size_t)(2 * b.bins * config.mics * config.mics));
         float *powers = malloc(sizeof(float) * (size_t)(3 * lag + 3));
         CHECK(now && noise && powers, "memory");
+        float expected = 0.0f;
         for (int n = 0; n < 3 * lag + 3; n++) {
             be_silent(&b);
             add_hiss(&b, 0.1f);
             locagen_steer_listen(b.kernel, b.in, b.power);
             locagen_steer_bins(b.kernel, now);
             powers[n] = now[0] * now[0] + now[1] * now[1];
-            CHECK(locagen_steer_learn(b.kernel, 1.0f) == 0, "learnt");
-            locagen_steer_noise(b.kernel, noise);
-            float expected = n < lag ? 0.0f : powers[n - lag];
-            CHECK(fabsf(noise[0] - expected) <= 1e-5f * expected, "lag %d, frame %d", lag, n);
+            for (int ago = lag; ago >= 0; ago -= 1 + ago / 2) {
+                CHECK(locagen_steer_learn(b.kernel, ago, 1.0f) == 0, "learnt");
+                locagen_steer_noise(b.kernel, noise);
+                expected = ago <= n ? powers[n - ago] : expected; /* nothing where so many have not been */
+                CHECK(fabsf(noise[0] - expected) <= 1e-5f * expected, "%d ago of %d, frame %d", ago, lag, n);
+            }
         }
+        CHECK(locagen_steer_learn(b.kernel, lag + 1, 1.0f) == LOCAGEN_E_LAG, "older than the ring");
+        CHECK(locagen_steer_learn(b.kernel, -1, 1.0f) == LOCAGEN_E_LAG, "yet to come");
         free(now), free(noise), free(powers);
         steer_tear_down(&b);
     }
@@ -577,8 +582,8 @@ static void test_steered_spans(const locagen_steer_paths *chosen)
     add_hiss(&b, 0.1f);
     locagen_steer_listen(b.kernel, b.in, b.power);
     locagen_steer_hear(b.kernel, 1, 1.0f);
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "span 0 has heard nothing");
-    CHECK(locagen_steer_search(b.kernel, 1, 1, 0, b.sources) == 1, "span 1 has");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 0, "span 0 has heard nothing");
+    CHECK(locagen_steer_search(b.kernel, 1, 1, 0, 0, b.sources) == 1, "span 1 has");
     for (int n = 0; n < 2; n++) {
         CHECK(locagen_steer_watch(b.kernel, 1) == 0, "watched");
         CHECK(locagen_steer_settle(b.kernel, 1, 0.1f) == 0, "settled");
@@ -586,17 +591,17 @@ static void test_steered_spans(const locagen_steer_paths *chosen)
     add_wave(&b, 1.0, -0.5, 0.1f);
     locagen_steer_listen(b.kernel, b.in, b.power);
     locagen_steer_hear(b.kernel, 0, 1.0f), locagen_steer_hear(b.kernel, 1, 1.0f);
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 1, "a call");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 1, "a call");
     float score = b.sources[0].score;
     CHECK(b.sources[0].contrast > -0.1f * score, "one source is as good a reason: %g of %g",
           (double)b.sources[0].contrast, (double)score);
-    CHECK(locagen_steer_search(b.kernel, 1, 1, 0, b.sources) == 1, "a call, watched");
+    CHECK(locagen_steer_search(b.kernel, 1, 1, 0, 0, b.sources) == 1, "a call, watched");
     CHECK(b.sources[0].score <= score * 1.001f, "watching only lessens: %g, %g", (double)b.sources[0].score,
           (double)score);
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 2 * score, b.sources) == 0, "not loud enough");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 2 * score, 0, b.sources) == 0, "not loud enough");
     float *weight = calloc((size_t)b.bins, sizeof *weight);
     CHECK(weight && locagen_steer_weigh(b.kernel, weight) == 0, "no bin counts");
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "nothing to score");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 0, "nothing to score");
     free(weight);
     steer_tear_down(&b);
 
@@ -606,7 +611,7 @@ static void test_steered_spans(const locagen_steer_paths *chosen)
     add_hiss(&b, 0.3f);
     locagen_steer_listen(b.kernel, b.in, b.power);
     locagen_steer_hear(b.kernel, 0, 1.0f);
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 1, "louder noise");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 1, "louder noise");
     CHECK(b.sources[0].contrast < -0.5f * b.sources[0].score, "no source is the better reason: %g of %g",
           (double)b.sources[0].contrast, (double)b.sources[0].score);
     steer_tear_down(&b);
@@ -615,26 +620,26 @@ static void test_steered_spans(const locagen_steer_paths *chosen)
 static void test_steered_silence(const locagen_steer_paths *chosen)
 {
     steer_bench b = steer_set_up(STEERED, chosen);
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "nothing heard");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 0, "nothing heard");
     be_silent(&b);
     for (int learnt = 0; learnt < 2; learnt++) {
         CHECK(locagen_steer_listen(b.kernel, b.in, b.power) == 0, "silence is finite");
         locagen_steer_hear(b.kernel, 0, 1.0f);
-        CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "silence, learnt %d", learnt);
+        CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 0, "silence, learnt %d", learnt);
         CHECK(locagen_steer_map(b.kernel, 0, b.map) == 0, "map");
         int wrong = 0;
         for (int n = 0; n < 60 * 7; n++)
             wrong += b.map[n] != 0.0f;
         CHECK(wrong == 0, "%d scores are not zero", wrong);
-        locagen_steer_learn(b.kernel, 0.5f);
+        locagen_steer_learn(b.kernel, 0, 0.5f);
     }
     add_wave(&b, 1.0, -0.6, 0.1f);
     locagen_steer_listen(b.kernel, b.in, b.power);
     locagen_steer_hear(b.kernel, 0, 1.0f);
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 1, "a source over silence");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 1, "a source over silence");
     CHECK(all_finite(b.sources) && off_by(b.sources, 1.0, -0.6) < 1, "%.2f degrees", off_by(b.sources, 1.0, -0.6));
     locagen_steer_reset(b.kernel);
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 0, "forgotten");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 0, "forgotten");
     steer_tear_down(&b);
 }
 
@@ -650,7 +655,7 @@ static void test_steered_paths_agree(void)
     add_hiss(&b, 0.1f);
     locagen_steer_listen(b.kernel, b.in, b.power), locagen_steer_listen(c.kernel, b.in, c.power);
     locagen_steer_hear(b.kernel, 0, 1.0f), locagen_steer_hear(c.kernel, 0, 1.0f);
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, b.sources) == 1 && locagen_steer_search(c.kernel, 0, 1, 0, c.sources) == 1,
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 1 && locagen_steer_search(c.kernel, 0, 1, 0, 0, c.sources) == 1,
           "one source");
     /* Rounding through two inverses, of matrices from ten frames. */
     float ratio = b.sources->score / c.sources->score;
@@ -715,20 +720,21 @@ static void test_steered_refusals(void)
     CHECK(locagen_steer_listen(NULL, b.in, b.power) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_listen(b.kernel, NULL, b.power) == LOCAGEN_E_NULL, "no input");
     CHECK(locagen_steer_listen(b.kernel, b.in, NULL) == LOCAGEN_E_NULL, "no power");
-    CHECK(locagen_steer_learn(NULL, 0.5f) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_learn(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_hear(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
-    CHECK(locagen_steer_learn(b.kernel, NAN) == LOCAGEN_E_SHARE, "no share");
+    CHECK(locagen_steer_learn(b.kernel, 0, NAN) == LOCAGEN_E_SHARE, "no share");
     CHECK(locagen_steer_hear(b.kernel, 0, 1.5f) == LOCAGEN_E_SHARE, "too large a share");
-    CHECK(locagen_steer_search(NULL, 0, 1, 0, b.sources) == LOCAGEN_E_NULL, "no state");
-    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, NULL) == LOCAGEN_E_NULL, "no output");
-    CHECK(locagen_steer_search(b.kernel, 0, 0, 0, b.sources) == LOCAGEN_E_COUNT, "no sources asked for");
-    CHECK(locagen_steer_search(b.kernel, 0, 1, NAN, b.sources) == LOCAGEN_E_LEAST, "least");
+    CHECK(locagen_steer_search(NULL, 0, 1, 0, 0, b.sources) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, NULL) == LOCAGEN_E_NULL, "no output");
+    CHECK(locagen_steer_search(b.kernel, 0, 0, 0, 0, b.sources) == LOCAGEN_E_COUNT, "no sources asked for");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, NAN, 0, b.sources) == LOCAGEN_E_LEAST, "least");
+    CHECK(locagen_steer_search(b.kernel, 0, 1, 0, -1, b.sources) == LOCAGEN_E_LEAST, "further");
     for (int span = -1; span <= 2; span += 3) {
         CHECK(locagen_steer_hear(b.kernel, span, 0.5f) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_watch(b.kernel, span) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_settle(b.kernel, span, 0.5f) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_doubt(b.kernel, span) == LOCAGEN_E_SPAN, "span %d", span);
-        CHECK(locagen_steer_search(b.kernel, span, 1, 0, b.sources) == LOCAGEN_E_SPAN, "span %d", span);
+        CHECK(locagen_steer_search(b.kernel, span, 1, 0, 0, b.sources) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_map(b.kernel, span, b.map) == LOCAGEN_E_SPAN, "span %d", span);
     }
     CHECK(locagen_steer_watch(NULL, 0) == LOCAGEN_E_NULL, "no state");

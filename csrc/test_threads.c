@@ -68,11 +68,11 @@ static size_t heard(int number, float *out)
             break;
         locagen_steer_listen(search, in, power);
         if (n < 9)
-            locagen_steer_learn(search, 1.0f / (float)(n + 1));
+            locagen_steer_learn(search, 0, 1.0f / (float)(n + 1));
         for (int s = 0; s < steer.spans; s++)
             locagen_steer_hear(search, s, n < 9 ? 0.5f : 1.0f);
     }
-    int found = locagen_steer_search(search, 0, 2, 0.0f, sources);
+    int found = locagen_steer_search(search, 0, 2, 0.0f, 0.0f, sources);
     out[count++] = (float)found;
     memcpy(out + count, sources, sizeof sources);
     count += sizeof sources / (sizeof(float));

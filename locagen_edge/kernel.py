@@ -180,7 +180,7 @@ class Steered:
             accuracy to tapering, Hann 39 %; Hann keeps strong tones of the noise out of other bins.
         smooth_bins: bins each side over which the source's spectrum is taken for smooth.
         spans: averages of the signal side by side, each with a memory of its own.
-        lag: `learn` takes the frame of so many hops ago: what calls is known only after a while.
+        lag: `learn` can take a frame of so many hops ago: what calls is known only after a while.
         loading: added to the noise's diagonal, as a share of its mean: the deepest null is this deep.
         smear: share of the noise's matrix, averaged over 100 Hz to each side, that is added to it.
         floor: the same as power of one bin, mean square of full scale.
@@ -289,9 +289,9 @@ class Steered:
         bad: int = self._listen(self._state, _pointer(samples, self._shape), self._power_pointer)
         return self._power.copy(), bad
 
-    def learn(self, share: float) -> None:
-        """Puts the frame of `lag` hops ago into the noise's matrix: R <- (1 - share) R + share x x^H."""
-        _check(lib.locagen_steer_learn(self._state, share))
+    def learn(self, share: float, ago: int = 0) -> None:
+        """Puts the frame of so many hops ago into the noise's matrix: R <- (1 - share) R + share x x^H."""
+        _check(lib.locagen_steer_learn(self._state, ago, share))
 
     def hear(self, share: float = 1.0, span: int = 0) -> None:
         """The same for the signal's matrix of a span, with the last frame; 1: this frame alone."""
@@ -316,15 +316,17 @@ class Steered:
         """Weights 0 to 1 of all bins in the band, float32, shape `(bins,)`, for the searches to come."""
         _check(lib.locagen_steer_weigh(self._state, _pointer(weight, (len(self.frequency_hz),))))
 
-    def search(self, max_sources: int = 1, span: int = 0, least: float = 0.0) -> tuple[Source, ...]:
+    def search(
+        self, max_sources: int = 1, span: int = 0, least: float = 0.0, further: float = 0.0
+    ) -> tuple[Source, ...]:
         """The sources in the span's matrix, strongest first; at most one less than there are microphones.
 
-        None before `hear`, in silence and with less than two microphones; none that scores `least` or less.
-        Where nothing was learnt the noise is taken for white, and its level from what is across the best
-        direction.
+        None before `hear`, in silence and with less than two microphones; none that scores `least` or less,
+        and beside the first none that scores `further` or less. Where nothing was learnt the noise is taken
+        for white, and its level from what is across the best direction.
         """
         room = min(max_sources, _MOST_MICS)
-        found = _check(lib.locagen_steer_search(self._state, span, room, least, self._sources))
+        found = _check(lib.locagen_steer_search(self._state, span, room, least, further, self._sources))
         return tuple(
             Source(s.azimuth_rad, s.elevation_rad, s.score, s.contrast, s.rival, s.snr, tuple(s.information))
             for s in self._sources[0:found]

@@ -253,6 +253,53 @@ def test_under_rotors_the_steered_search_hears_what_delays_do_not():
     assert median["steered"] < 0.3 * median["far-field"]
 
 
+def test_a_second_after_the_start_a_caller_is_found():
+    """0.8 s of rotors are learnt as they come: five frames per microphone, and no lag before them."""
+    settings = from_table(EXACT)
+    rate = settings.audio.rate_hz
+    noise = rotor_sound(settings, 2.2, np.random.default_rng(4)).astype(np.float32)
+    call = CALLS["scream"](rate, rate, 4800.0, np.random.default_rng(4))
+    for azimuth in (-2.0, 0.4, 2.8):
+        mixed = call_over_noise(settings, call, noise, rate, 0.9, azimuth, 5.0).astype(np.float32)
+        told = [e for e in process(settings, mixed) if e.detection.call]
+        assert told
+        assert (told[0].t_ns * 1e-9) + settings.audio.frame / rate < 1.3
+        assert abs(error_deg(told[0], azimuth)) < 3.0
+
+
+def test_after_a_loud_caller_has_stopped_his_average_is_not_told():
+    """What an average over a second still holds of him is no call, nor is the hop that notices it."""
+    settings = from_table(EXACT)
+    rate = settings.audio.rate_hz
+    noise = 0.02 * np.random.default_rng(5).standard_normal((3, 8 * rate)).astype(np.float32)
+    call = CALLS["scream"](rate, rate, 4800.0, np.random.default_rng(5))
+    mixed = call_over_noise(settings, call, noise, rate, 5.0, 1.0, 15.0).astype(np.float32)
+    estimates = process(settings, mixed)
+    assert any(e.detection.call for e in estimates if 5.0 < e.t_ns * 1e-9 < 5.9)
+    assert not any(e.detection.call for e in estimates if e.t_ns * 1e-9 > 6.0)
+
+
+def test_hunting_rotors_are_no_callers_while_they_are_learnt():
+    """Each rotor's speed up and down by 10 % a second, power with its 5th: starts of 10 s, from nothing."""
+    settings = from_table({})
+    rate = settings.audio.rate_hz
+    for seed in (0, 2, 5):
+        rng = np.random.default_rng(seed)
+        time_s = np.arange(10 * rate) / rate
+        noise = np.zeros((3, len(time_s)))
+        for hub in hubs_m(4, 0.3):
+            zigzag = 4.0 * np.abs((time_s / 4.0 + rng.uniform()) % 1.0 - 0.5) - 1.0
+            speed = np.exp(0.1 * zigzag)
+            turned = np.cumsum(speed)
+            pieces, length = rotor(0.5, rate, 0.48 * rate, rng), math.ceil(turned[-1]) + 2
+            sound = np.concatenate(list(itertools.islice(pieces, length // 5000 + 1)))
+            hunting = np.interp(turned, np.arange(len(sound)), sound) * speed**2.5
+            noise += place(hunting, rate, settings.mic_array.positions_m, hub, settings.speed_m_s)
+        noise /= math.sqrt(np.mean([band_power(row, rate) for row in noise]))
+        noise += 0.1 * rng.standard_normal(noise.shape)
+        assert not any(e.detection.call for e in process(settings, (0.02 * noise).astype(np.float32)))
+
+
 def test_the_steered_search_says_nothing_of_noise_alone():
     settings = from_table({**EXACT, "bearing": {"estimator": "steered"}})
     rng = np.random.default_rng(2)

@@ -681,6 +681,42 @@ def test_noise_that_strays_scores_no_higher_than_noise_that_keeps_still() -> Non
     assert best[True][1] > 0.6 * best[False][1]
 
 
+def test_noise_that_strays_is_told_in_the_sigma() -> None:
+    """A call in the band in which a rotor comes and goes is less well known, the less the louder it is."""
+    wider = {}
+    for level in (0.007, 0.03, 0.2):
+        sigma = {}
+        for watched in (False, True):
+            rng = np.random.default_rng(7)
+            found = steered()
+            for _ in range(200):
+                samples = hunting(rng, 1.0, loud=rng.uniform() < 0.1)
+                if watched:
+                    listened(found, samples, 0.02)
+                else:
+                    listen(found, samples)
+                    found.learn(0.02)
+            call = wave(rng, 3.5, -0.5, level=level, band_hz=(1900.0, 2700.0))
+            (source,) = heard(found, hunting(rng, 1.0, loud=False) + call)
+            sigma[watched] = source.sigma_rad()[0]
+        wider[level] = sigma[True] / sigma[False]
+    assert wider[0.007] > 1.07
+    assert wider[0.007] > wider[0.03] > wider[0.2] > 0.99
+
+
+def test_a_further_source_has_to_be_worth_it() -> None:
+    rng = np.random.default_rng(8)
+    found = steered()
+    learn(found, [hiss(rng) for _ in range(60)])
+    both = heard(found, wave(rng, 0.5, -0.5) + wave(rng, 3.0, -0.4, level=0.06) + hiss(rng), 2)
+    assert len(both) == 2
+    assert found.search(2, further=0.5 * both[1].score) == both
+    assert len(found.search(2, further=1.5 * both[1].score)) == 1
+    assert len(found.search(2, further=1.5 * both[0].score)) == 1
+    with pytest.raises(KernelError):
+        found.search(2, further=-1.0)
+
+
 def test_in_still_noise_watching_changes_little() -> None:
     rng = np.random.default_rng(1)
     found, plain = steered(), steered()
@@ -739,7 +775,7 @@ def test_learning_lags_and_spans_keep_apart(lag: int) -> None:
     frames = [hiss(rng) for _ in range(lag + 5)]
     for samples in frames:
         listen(found, samples)
-        found.learn(0.5)
+        found.learn(0.5, lag)
         found.hear(1.0, span=0)
         found.hear(0.25, span=1)
     for samples in frames[:5]:

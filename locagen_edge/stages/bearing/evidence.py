@@ -13,7 +13,6 @@ The onset is the change point of greatest likelihood in the frames' own scores t
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 
@@ -22,10 +21,11 @@ from locagen_edge.types import F32
 SCORE = 20.0
 """Added to the average: the least that noise gives, however still it keeps."""
 YOUNG, YOUNG_S = 600.0, 1.6
-"""Added while the noise has just been learnt and is hardly known: falls by e in each of these times."""
+"""The average counts as at least so much while the noise has just been learnt, of a matrix from few frames;
+falls by e in each of these times."""
 MEMORY_S = 20.0
-LOUDEST = 2.0
-"""The average takes no more than so many times itself at once: a call that was not recognised."""
+LOUDEST = 5.0
+"""The average takes no more than so many times its level at once: a call that was not recognised."""
 CLIP = 60.0
 """A frame's score counts up to here, so that one clap does not outweigh a second of voice."""
 DRIFT = 3.0
@@ -41,10 +41,11 @@ RISE_S = 0.08
 
 
 class Usual:
-    """What the best score of noise alone is, on average."""
+    """What the best score of noise alone is, on average: at first of late, for rotors that hunt show it soon;
+    then of `MEMORY_S`."""
 
     def __init__(self) -> None:
-        self._sum = self._weight = 0.0
+        self._average, self._frames = 0.0, 0
         self._youth = YOUNG
 
     def ratio(self, score: float) -> float:
@@ -58,20 +59,25 @@ class Usual:
     @property
     def level(self) -> float:
         """The score whose ratio is 1."""
-        return self.known + self._youth
+        return SCORE + max(self._average, self._youth)
 
     @property
     def known(self) -> float:
-        """The same without what is added for the noise being hardly known yet."""
-        return SCORE + (self._sum / self._weight if self._weight else 0.0)
+        """The same without what the noise counts as for being hardly known yet."""
+        return SCORE + self._average
+
+    def age(self, elapsed_s: float) -> None:
+        """Time in which something called."""
+        self._youth *= math.exp(-elapsed_s / YOUNG_S)
 
     def learn(self, score: float, elapsed_s: float) -> None:
-        self._youth *= math.exp(-elapsed_s / YOUNG_S)
-        if self.young:
-            return
-        share = 1.0 - math.exp(-elapsed_s / MEMORY_S)
-        self._sum += share * (min(score, LOUDEST * self.level) - self._sum)
-        self._weight += share * (1.0 - self._weight)
+        """A score of noise alone."""
+        most = LOUDEST * self.level
+        self.age(elapsed_s)
+        self._frames += 1
+        # 3 / (n + 2): each score weighs about as the square of the number of those before it
+        share = max(1.0 - math.exp(-elapsed_s / MEMORY_S), 3.0 / (self._frames + 2))
+        self._average += share * (min(score, most) - self._average)
 
 
 class Onsets:
@@ -80,39 +86,58 @@ class Onsets:
     def __init__(self, hop_s: float):
         self._hop_s = hop_s
         self._recent = max(1, round(RECENT_S / hop_s))
-        self._history: deque[F32] = deque(maxlen=max(2, round(HISTORY_S / hop_s)))
+        self._ring: F32 | None = None
+        self._frames = max(2, round(HISTORY_S / hop_s))
+        self._next = self._held = 0
         self._usual: F32 | None = None
 
     def hear(self, scores: F32) -> None:
         """(directions...) of one frame."""
-        self._history.append(np.minimum(scores.ravel(), np.float32(CLIP)))
+        if self._ring is None:
+            self._ring = np.empty((self._frames, scores.size), np.float32)
+        np.minimum(scores.ravel(), np.float32(CLIP), out=self._ring[self._next])
+        self._next = (self._next + 1) % self._frames
+        self._held = min(self._held + 1, self._frames)
 
     def learn(self, lag: int, elapsed_s: float) -> None:
         """The frame `lag` before the last held no call."""
-        if len(self._history) <= lag:
+        if self._ring is None or self._held <= lag:
             return
         share = np.float32(1.0 - math.exp(-elapsed_s / MEMORY_S))
-        then = self._history[-1 - lag]
-        self._usual = then.copy() if self._usual is None else self._usual + share * (then - self._usual)
+        then = self._ring[(self._next - 1 - lag) % self._frames]
+        if self._usual is None:
+            self._usual = then.copy()
+        else:
+            self._usual += share * (then - self._usual)
 
-    def _towards(self, direction: int) -> np.ndarray:
-        """How far each frame's score is above what is usual there, the oldest first."""
-        usual = 0.0 if self._usual is None else float(self._usual[direction])
-        return np.array([scores[direction] for scores in self._history]) - usual
+    def _towards(self, direction: int) -> list[float]:
+        """Each frame's score there, the last first."""
+        if self._ring is None:
+            return []
+        scores: list[float] = self._ring[:, direction].tolist()
+        last = self._next
+        return (scores[:last][::-1] + scores[last:][::-1])[: self._held]
+
+    def _usual_towards(self, direction: int) -> float:
+        return 0.0 if self._usual is None else float(self._usual[direction])
 
     def going_on(self, direction: int) -> bool:
         """Whether it still calls from there: an average over a second remembers what has ended."""
-        usual = LEAST_USUAL if self._usual is None else max(float(self._usual[direction]), LEAST_USUAL)
-        recent = list(self._history)[-self._recent :]
-        return float(np.mean([scores[direction] for scores in recent])) > usual + DRIFT
+        recent = self._towards(direction)[: self._recent]
+        usual = max(self._usual_towards(direction), LEAST_USUAL)
+        return sum(recent) > len(recent) * (usual + DRIFT)
 
     def since_s(self, direction: int) -> float:
         """For how long it has called from there, at the last frame's end; `HISTORY_S` at most."""
-        above = self._towards(direction)
-        drift = max(DRIFT, SHARE * float(above[-self._recent :].max()))
-        from_the_end = np.cumsum(above[::-1] - drift)
-        return int(from_the_end.argmax()) * self._hop_s + RISE_S
+        scores, usual = self._towards(direction), self._usual_towards(direction)
+        drift = max(DRIFT, SHARE * (max(scores[: self._recent], default=0.0) - usual))
+        total, most, frames = 0.0, -math.inf, 0
+        for n, score in enumerate(scores):
+            total += score - usual - drift
+            if total > most:
+                most, frames = total, n
+        return frames * self._hop_s + RISE_S
 
     def forget(self) -> None:
         """Time has gone by unheard."""
-        self._history.clear()
+        self._held = 0

@@ -16,12 +16,12 @@ from collections import deque
 
 import numpy as np
 
-from locagen_edge.geometry import direction, tolerance_rad
+from locagen_edge.geometry import tolerance_rad
 from locagen_edge.kernel import Source, Steered
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import LARGEST_AZIMUTH_SIGMA_RAD, NOWHERE_RAD, no_bearing
 from locagen_edge.stages.bearing.evidence import Onsets, Usual
-from locagen_edge.types import F32, F64, Bearing, Evidence, Frame, Mask, Tdoa
+from locagen_edge.types import F32, Bearing, Evidence, Frame, Mask, Tdoa
 
 NAME = "steered"
 
@@ -33,7 +33,8 @@ LOOKS = 5
 learnt from fewer is nearly singular, and whitening by it invents sources."""
 
 LAG_S = 0.5
-"""Noise is learnt so late: by then a call is known as one, and its beginning is not learnt."""
+"""Noise is learnt so late: by then a call is known as one, and its beginning is not learnt. At the start it
+is learnt at once, for before the first bearing nothing can be known as a call."""
 MEANING = 1.3
 """Evidence from which a direction means something, though not yet a call."""
 WATCH_S = 15.0
@@ -50,7 +51,7 @@ SILENCE = 1e-11
 RIVAL = 0.97
 """Score of another lobe over the best from which nobody knows which is true, however loud the caller: the
 microphones stand where they should to within their tolerance only."""
-CLOSER = 1.5
+CLOSER = 2.5
 """Roots of the score by which the best lobe has to be ahead of any other: chance gives as much. A whistle of
 3 kHz, whose wavelength is shorter than twice the array, has lobes that are nearly alike; a voice has one."""
 SECOND = 0.2
@@ -80,15 +81,14 @@ class SteeredLocator:
             smear=steered.smear,
             floor=10 ** (settings.correlation.floor_dbfs / 10),
         )
-        rows, columns = np.meshgrid(self._search.elevation_rad, self._search.azimuth_rad, indexing="ij")
-        self._grid_u = np.stack(
-            [direction(float(a), float(e)) for a, e in zip(columns.ravel(), rows.ravel(), strict=True)]
-        )
+        self._rows, self._columns = len(self._search.elevation_rad), len(self._search.azimuth_rad)
+        self._top_rad = float(self._search.elevation_rad[0])
+        self._row_rad = self._top_rad - float(self._search.elevation_rad[1])
         first = self._search.first_bin
         self._band = slice(first, first + len(self._search.frequency_hz))
         self._weights: F32 = np.ones((len(self._spans_s), len(self._search.frequency_hz)), dtype=np.float32)
         places_m = settings.mic_array.positions_m - settings.mic_array.positions_m.mean(axis=0)
-        self._spread_m2: F64 = places_m.T @ places_m
+        self._spread_m2: list[list[float]] = (places_m.T @ places_m).tolist()
         self._tolerance_m = settings.array.tolerance_m
         self._tolerance = tolerance_rad(settings.mic_array, settings.array.tolerance_m)
         self._mics = settings.mic_array.mics
@@ -103,11 +103,12 @@ class SteeredLocator:
         """Neither noise nor what has just been heard."""
         self._begin_anew()
         self._onsets = Onsets(self._hop_s)
-        self._scores = [0.0 for _ in self._spans_s]
+        self._scores: list[float | None] = [None for _ in self._spans_s]  # the best, where it was looked for
         self._ratios = [0.0 for _ in self._spans_s]  # how those stand out
         self._strange = [False for _ in self._spans_s]
         self._strange_hops = 0
         self._loud_hops_ago: int | None = None
+        self._to_judge = 0  # the last frames, of which nobody knows yet whether they are noise
         self._failing: deque[bool] = deque(maxlen=self._lag + 1)
         self._silent: deque[bool] = deque(maxlen=self._lag + 1)
         self._quiet_hops = 0
@@ -136,20 +137,22 @@ class SteeredLocator:
         self, frame: Frame, _: Tdoa, elapsed_s: float, mask: Mask | None = None, /
     ) -> tuple[Bearing, ...]:
         power, bad_mics = self._search.listen(frame.samples)
-        failing = bad_mics != 0 or power.min() < DEAD * power.max()
+        levels = power.tolist()
+        loudest = max(levels)
+        failing = bad_mics != 0 or min(levels) < DEAD * loudest
         self._bad_hops = self._bad_hops + 1 if failing else 0
-        self._failing.append(bool(failing))
-        self._silent.append(bool(power.max() < SILENCE))
+        self._failing.append(failing)
+        self._silent.append(loudest < SILENCE)
         self._elapsed_s = elapsed_s
         self._mask = mask
         if elapsed_s > LAG_S:
             self._onsets.forget()
         found = [self._heard(span, elapsed_s) for span in range(len(self._spans_s))]
-        self._ratios = [usual.ratio(score) for usual, score in zip(self._usual, self._scores, strict=True)]
         if self._to_learn > 0:
             return (no_bearing(NAME),)
+        best = self._best(found)
         self._end_of_a_loud_call()
-        return self._best(found) or (no_bearing(NAME, Evidence(min(max(self._ratios), MEANING), 0.0)),)
+        return best or (no_bearing(NAME, Evidence(min(max(self._ratios), MEANING), 0.0)),)
 
     def _best(self, found: list[list[Source]]) -> tuple[Bearing, ...]:
         """Of the spans: the frame where that is a call by itself, else whichever stands out more."""
@@ -159,7 +162,7 @@ class SteeredLocator:
             order = [0, *order]
         for span in order:
             # between a loud caller's sounds an average only tells where he was
-            if not found[span] or (span > 0 and self._loud_hops_ago):
+            if not found[span] or (span > 0 and self._loud_hops_ago is not None):
                 continue
             towards = self._nearest(found[span][0])
             # an average over a second remembers what has ended
@@ -191,23 +194,34 @@ class SteeredLocator:
         if self._mask is not None:
             weight = np.square(self._mask.weight[self._band])  # a gain's square is what is left of power
             self._weights[span] += np.float32(share) * (weight - self._weights[span])
+        self._strange[span] = False
+        if span > 0 and self._ratios[0] >= self._least_ratio:
+            # the frame places him, and in the average he stands out no less: half of the work is spared
+            self._scores[span], self._ratios[span] = None, self._ratios[0]
+            return []
         sources = self._sources(span)
         scores: F32 = self._search.map(span)
         if span == 0:
             self._onsets.hear(scores)
         best = float(scores.max())
-        self._scores[span] = max(best, sources[0].score if sources else 0.0)
-        self._strange[span] = False
         if not sources:
+            self._note(span, best)
             return []
-        if sources[0].contrast < LOUDER * sources[0].score or scores.min() > FLAT * best:
-            self._scores[span], self._strange[span] = 0.0, True
+        first = sources[0]
+        if first.contrast < LOUDER * first.score or float(scores.min()) > FLAT * best:
+            self._note(span, 0.0)
+            self._strange[span] = True
             return []
-        least = max(SECOND * sources[0].score, self._least_ratio * self._usual[span].level)
+        self._note(span, max(best, first.score))
+        least = max(SECOND * first.score, self._least_ratio * self._usual[span].level)
         return [s for n, s in enumerate(sources) if n == 0 or s.score > least]
 
+    def _note(self, span: int, score: float) -> None:
+        self._scores[span], self._ratios[span] = score, self._usual[span].ratio(score)
+
     def _sources(self, span: int) -> tuple[Source, ...]:
-        return self._search.search(2, span, MEANING * self._usual[span].known)
+        usual = self._usual[span]
+        return self._search.search(2, span, MEANING * usual.known, self._least_ratio * usual.level)
 
     def _placed(self, found: list[Source], span: int) -> list[Source]:
         """Callers once more, by the bins that are theirs; as they were found where those hold too little.
@@ -222,7 +236,9 @@ class SteeredLocator:
 
     def _nearest(self, source: Source) -> int:
         """On the grid."""
-        return int(np.argmax(self._grid_u @ direction(source.azimuth_rad, source.elevation_rad)))
+        row = round((self._top_rad - source.elevation_rad) / self._row_rad)
+        column = round(source.azimuth_rad * self._columns / math.tau) % self._columns
+        return min(max(row, 0), self._rows - 1) * self._columns + column
 
     def _told(self, source: Source, span: int, evidence: Evidence) -> Bearing:
         if _may_be_elsewhere(source):
@@ -231,6 +247,12 @@ class SteeredLocator:
 
     def _placed_at(self, source: Source, span: int, evidence: Evidence | None) -> Bearing:
         azimuth_sigma, elevation_sigma = source.sigma_rad()
+        span_s = self._spans_s[span]
+        if evidence is not None and span_s > 0.0:
+            # A call that began t ago weighs 1 - exp(-t / span) in the average, and 1 - exp(-2 t / span) among
+            # the squares that make the variance: its looks are fewer than if it had gone on all the time.
+            fewer = math.sqrt(1.0 + math.exp(-evidence.since_s / span_s))
+            azimuth_sigma, elevation_sigma = fewer * azimuth_sigma, fewer * elevation_sigma
         of_azimuth, of_elevation = self._of_positions(source)
         azimuth_sigma = math.hypot(azimuth_sigma, of_azimuth)
         elevation_sigma = math.hypot(elevation_sigma, of_elevation)
@@ -242,7 +264,7 @@ class SteeredLocator:
             misfit=0.0,  # the score has judged already whether a source explains the frame
             estimator=NAME,
             evidence=evidence,
-            span_s=self._spans_s[span],
+            span_s=span_s,
         )
 
     def _of_positions(self, source: Source) -> tuple[float, float]:
@@ -250,14 +272,18 @@ class SteeredLocator:
         microphones' ways, as in `tolerance_rad`. A flat array sees the elevation through its cosine, which
         hardly changes near the horizon."""
         c, s = math.cos(source.azimuth_rad), math.sin(source.azimuth_rad)
-        level, below = max(math.cos(source.elevation_rad), 0.1), math.sin(source.elevation_rad)
-        arcs = np.array([[-s, c, 0.0], [-below * c, -below * s, -math.cos(source.elevation_rad)]])
-        seen = arcs @ self._spread_m2 @ arcs.T
+        level, below = math.cos(source.elevation_rad), math.sin(source.elevation_rad)
+        # Over the microphones, of the arc towards greater azimuth (-s, c, 0), of the other one
+        # (-below c, -below s, -level), and of both. Plain numbers: small arrays cost ten times as much.
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = self._spread_m2
+        along = c * c * xx + 2.0 * c * s * xy + s * s * yy
+        azimuth = s * s * xx - 2.0 * s * c * xy + c * c * yy
+        both = below * (s * c * (xx - yy) - (c * c - s * s) * xy) + level * (s * xz - c * yz)
+        elevation = below * below * along + 2.0 * below * level * (c * xz + s * yz) + level * level * zz
         # on the very horizon the second order is left: 1 - cos(error) is what the positions are off by
-        seen[1, 1] += 0.5 * self._tolerance * seen[0, 0]
-        determinant = float(seen[0, 0] * seen[1, 1] - seen[0, 1] * seen[1, 0])
-        scale = self._tolerance_m / math.sqrt(max(determinant, 1e-18))
-        return scale * math.sqrt(seen[1, 1]) / level, scale * math.sqrt(seen[0, 0])
+        elevation += 0.5 * self._tolerance * azimuth
+        scale = self._tolerance_m / math.sqrt(max(azimuth * elevation - both * both, 1e-18))
+        return scale * math.sqrt(max(elevation, 0.0)) / max(level, 0.1), scale * math.sqrt(max(azimuth, 0.0))
 
     def likeliest(self, span: int = 0) -> Bearing:
         """The best direction of a span's last frame, however little it stands out: to judge the search by."""
@@ -282,19 +308,29 @@ class SteeredLocator:
             # rotors have started: every frame in the ring is of now
             if self._strange_hops > self._lag or self._busy_s > LONGEST_S:
                 self._begin_anew()
+        self._to_judge = min(self._to_judge + 1, self._lag + 1)
+        while self._to_judge > (self._lag if self._to_learn <= 0 else 0):
+            self._to_judge -= 1
+            self._learn(self._to_judge)
+
+    def _learn(self, ago: int) -> None:
+        """The frame of so many hops ago."""
         patient = self._to_learn <= 0 and self._bad_hops <= self._patience
-        if len(self._failing) > self._lag and not (self._silent[0] or (patient and self._failing[0])):
-            surest = max(self._since_lag) if self._to_learn <= 0 else 0.0
-            caution = min(1.0, (self._least_ratio / max(surest, 1e-9)) ** 2)
-            share = max(1.0 - math.exp(-self._elapsed_s / self._forget_s), 1.0 / (self._learnt_frames + 1))
-            self._search.learn(caution * share)
-            self._learnt_frames += 1
-            self._to_learn = max(self._to_learn - 1, 0)
+        if self._silent[-1 - ago] or (patient and self._failing[-1 - ago]):
+            return
+        surest = max(self._since_lag) if self._to_learn <= 0 else 0.0
+        caution = min(1.0, (self._least_ratio / max(surest, 1e-9)) ** 2)
+        share = max(1.0 - math.exp(-self._elapsed_s / self._forget_s), 1.0 / (self._learnt_frames + 1))
+        self._search.learn(caution * share, ago)
+        self._learnt_frames += 1
+        self._to_learn = max(self._to_learn - 1, 0)
 
     def _watch(self, call: bool) -> None:
         """What the noise's scores are, put aside until it is sure that they are the noise's."""
         self._since_lag.append(max(self._ratios))
         self._quiet_hops = 0 if call else self._quiet_hops + 1
+        if self._to_judge < self._lag:
+            return  # just learnt from a few frames, and no more since: the noise is as unknown as it was
         quiet = self._quiet_hops * self._hop_s > PAUSE_S  # a call fades out, and its pauses are no noise
         for span in range(len(self._spans_s)):
             if not quiet:
@@ -304,7 +340,10 @@ class SteeredLocator:
             if quiet and self._quiet_hops % self._lag == 0:
                 self._search.settle(1.0 - math.exp(-self._hop_s / WATCH_S), span)
         for usual, score in zip(self._usual, self._scores, strict=True):
-            usual.learn(score, self._elapsed_s)
+            if score is not None and not call and usual.ratio(score) < self._least_ratio:
+                usual.learn(score, self._elapsed_s)
+            else:
+                usual.age(self._elapsed_s)
         if not self._usual[0].young and max(self._since_lag) < self._least_ratio:
             self._onsets.learn(self._lag, self._elapsed_s)
 
