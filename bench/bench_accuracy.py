@@ -6,7 +6,7 @@ Plain noise: a far caller on the horizon in the free field, exact fractional del
 microphone's own, SNR over 0 to half the rate, one frame of 0.1 s. Rotor noise: a caller below, in-band SNR,
 four simulated rotors and sensor noise 20 dB below them, or recorded ones; one frame, or one second.
 
-Each trial is a stream: noise alone for six seconds, then the call that is judged. `steered` hears all of it,
+Each trial is a stream: noise alone for twelve seconds, then the call that is judged. `steered` hears all of it,
 as it does in flight, estimators from delays the end of it; the peers get the call, which is all they take.
 `steered` answers always, as its peers do: the direction of greatest likelihood. `steered, told` is what the
 pipeline says, which knows "no bearing"; each of those counts as the mean error of a guess.
@@ -46,7 +46,7 @@ from locagen_edge.types import F64, Frame, Tdoa
 
 ESTIMATORS = ("far-field", "hyperbolic", "two-mic", "model:tdoa-mlp")
 PEERS = ("SRP", "MUSIC", "NormMUSIC", "TOPS")
-LEAD = 120  # frames of noise before the call: 6.1 s
+LEAD = 240  # frames of noise before the call: 12.3 s
 LEAD_OF_LEVELS = 20  # for estimators that learn no more of the noise than its level
 SETTINGS: Settings = from_table({"array": {"tolerance_m": 0.0}})
 RATE = SETTINGS.audio.rate_hz

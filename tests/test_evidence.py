@@ -24,8 +24,8 @@ HOP_S = 0.05
 DIRECTIONS = 12
 
 
-def after(scores: list[float]) -> Usual:
-    usual = Usual()
+def after(scores: list[float], looks: float = 1.0) -> Usual:
+    usual = Usual(looks)
     for score in scores:
         usual.learn(score, HOP_S)
     return usual
@@ -44,8 +44,15 @@ def test_noise_that_hunts_is_known_within_seconds() -> None:
     """Every third second it scores ten times as much; after 6 s the next peak is no call."""
     still = [15.0] * 120
     hunting = [150.0 if n // 20 % 3 == 2 else 15.0 for n in range(120)]
-    assert after(still).ratio(150.0) > 1.5 * after(hunting).ratio(150.0)
-    assert after(hunting).ratio(150.0) < 2.0
+    assert after(still, 8.0).ratio(150.0) > 1.5 * after(hunting, 8.0).ratio(150.0)
+    assert after(hunting, 8.0).ratio(150.0) < 2.0
+
+
+@pytest.mark.parametrize("looks", [1.0, 8.0])
+def test_who_has_called_from_the_beginning_does_not_become_noise(looks: float) -> None:
+    """Words and pauses, before anything is known: a word of some seconds later is a call."""
+    words = [looks * 800.0 if n // 8 % 2 else 15.0 for n in range(60)]
+    assert after(words, looks).ratio(looks * 800.0) > 5.0
 
 
 @given(st.lists(st.floats(0.0, 1e9), max_size=200))

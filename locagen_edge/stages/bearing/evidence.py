@@ -28,6 +28,8 @@ LOUDEST = 5.0
 """The average takes no more than so many times its level at once: a call that was not recognised."""
 CLIP = 60.0
 """A frame's score counts up to here, so that one clap does not outweigh a second of voice."""
+UNSURE_S = 10.0
+"""So long it is not known whether what scores more is noise, or somebody who has called from the beginning."""
 DRIFT = 3.0
 """By how much a frame of a call is above what is usual, at least."""
 LEAST_USUAL = 4.0
@@ -42,10 +44,11 @@ RISE_S = 0.08
 
 class Usual:
     """What the best score of noise alone is, on average: at first of late, for rotors that hunt show it soon;
-    then of `MEMORY_S`."""
+    then of `MEMORY_S`. `looks`: what an average of the spectra scores over what a frame does, by its length."""
 
-    def __init__(self) -> None:
-        self._average, self._frames = 0.0, 0
+    def __init__(self, looks: float = 1.0) -> None:
+        self._average, self._heard_s, self._frames = 0.0, 0.0, 0
+        self._clip = CLIP * looks
         self._youth = YOUNG
 
     def ratio(self, score: float) -> float:
@@ -73,8 +76,11 @@ class Usual:
     def learn(self, score: float, elapsed_s: float) -> None:
         """A score of noise alone."""
         most = LOUDEST * self.level
+        if self._heard_s < UNSURE_S:
+            most = min(most, self._clip)
         self.age(elapsed_s)
         self._frames += 1
+        self._heard_s += elapsed_s
         # 3 / (n + 2): each score weighs about as the square of the number of those before it
         share = max(1.0 - math.exp(-elapsed_s / MEMORY_S), 3.0 / (self._frames + 2))
         self._average += share * (min(score, most) - self._average)

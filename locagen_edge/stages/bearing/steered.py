@@ -119,7 +119,8 @@ class SteeredLocator:
         self._learnt_frames = 0
         self._busy_s = 0.0
         self._to_learn = LOOKS * self._mics
-        self._usual = tuple(Usual() for _ in self._spans_s)
+        # an average is worth about half of the hops that it spans: frames overlap
+        self._usual = tuple(Usual(max(1.0, 0.5 * span_s / self._hop_s)) for span_s in self._spans_s)
 
     def apply(self, settings: Settings, /) -> None:
         """Limit and memories as these settings say; what was learnt of the noise stays."""
@@ -330,7 +331,9 @@ class SteeredLocator:
         self._since_lag.append(max(self._ratios))
         self._quiet_hops = 0 if call else self._quiet_hops + 1
         if self._to_judge < self._lag:
-            return  # just learnt from a few frames, and no more since: the noise is as unknown as it was
+            # just learnt from a few frames, and no more since: the noise is as unknown as it was
+            self._quiet_hops = 0
+            return
         quiet = self._quiet_hops * self._hop_s > PAUSE_S  # a call fades out, and its pauses are no noise
         for span in range(len(self._spans_s)):
             if not quiet:
