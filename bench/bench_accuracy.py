@@ -6,8 +6,8 @@ Plain noise: a far caller on the horizon in the free field, exact fractional del
 microphone's own, SNR over 0 to half the rate, one frame of 0.1 s. Rotor noise: a caller below, in-band SNR,
 four simulated rotors and sensor noise 20 dB below them, or recorded ones; one frame, or one second.
 
-Each trial is a stream: noise alone for twelve seconds, then the call that is judged. `steered` hears all of it,
-as it does in flight, estimators from delays the end of it; the peers get the call, which is all they take.
+Each trial is a stream: noise alone for twelve seconds, then the call that is judged. `steered` hears all of
+it, as it does in flight, estimators from delays the end of it; the peers get the call, which is all they take.
 `steered` answers always, as its peers do: the direction of greatest likelihood. `steered, told` is what the
 pipeline says, which knows "no bearing"; each of those counts as the mean error of a guess.
 

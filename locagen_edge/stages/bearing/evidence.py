@@ -29,7 +29,7 @@ LOUDEST = 5.0
 CLIP = 60.0
 """A frame's score counts up to here, so that one clap does not outweigh a second of voice."""
 UNSURE_S = 10.0
-"""So long it is not known whether what scores more is noise, or somebody who has called from the beginning."""
+"""So long it is not known whether what scores more is noise, or somebody who has called from the start."""
 DRIFT = 3.0
 """By how much a frame of a call is above what is usual, at least."""
 LEAST_USUAL = 4.0
@@ -44,7 +44,7 @@ RISE_S = 0.08
 
 class Usual:
     """What the best score of noise alone is, on average: at first of late, for rotors that hunt show it soon;
-    then of `MEMORY_S`. `looks`: what an average of the spectra scores over what a frame does, by its length."""
+    then of `MEMORY_S`. `looks`: what an average of the spectra scores over what a frame does."""
 
     def __init__(self, looks: float = 1.0) -> None:
         self._average, self._heard_s, self._frames = 0.0, 0.0, 0
