@@ -7,9 +7,9 @@ microphone's own, SNR over 0 to half the rate, one frame of 0.1 s. Rotor noise: 
 four simulated rotors and sensor noise 20 dB below them, or recorded ones; one frame, or one second.
 
 Each trial is a stream: noise alone for twelve seconds, then the call that is judged. `steered` hears all of
-it, as it does in flight, estimators from delays the end of it; the peers get the call, which is all they take.
-`steered` answers always, as its peers do: the direction of greatest likelihood. `steered, told` is what the
-pipeline says, which knows "no bearing"; each of those counts as the mean error of a guess.
+it, as it does in flight, estimators from delays the end of it; the peers get the call, which is all they
+take. `steered` answers always, as its peers do: the direction of greatest likelihood. `steered, told` is what
+the pipeline says, which knows "no bearing"; each of those counts as the mean error of a guess.
 
 The bound is Cramer and Rao's for an unknown sound (Hahn & Tretter 1973), from each trial's own spectrum.
 """

@@ -410,7 +410,8 @@ int locagen_steer_learn(locagen_steer *memory, int32_t ago, float share)
         return LOCAGEN_E_LAG;
     if (s->listened <= ago)
         return LOCAGEN_OK;
-    add(s, (s->slot + s->lag + 1 - ago) % (s->lag + 1), share, s->noise, s->lost_noise, &s->learnt, &s->learnt_variance, s->learnt_weights);
+    int slot = (s->slot + s->lag + 1 - ago) % (s->lag + 1);
+    add(s, slot, share, s->noise, s->lost_noise, &s->learnt, &s->learnt_variance, s->learnt_weights);
     s->inverse_mics = 0;
     return LOCAGEN_OK;
 }

@@ -378,14 +378,20 @@ def resample(
     Raises:
         KernelError: a wrong type, shape or layout, or samples that end too early.
     """
-    mics, length = samples.shape
-    rows = np.empty((count, mics), _FLOAT32)
-    _check(
-        lib.locagen_resample(
-            _pointer(table, (up, table.shape[-1])), table.shape[-1], up, down, at,
-            _pointer(samples, samples.shape), mics, length, ffi.from_buffer(_FLOATS, rows), count,
+    if np.ndim(table) != 2 or np.ndim(samples) != 2 or count < 0:
+        raise KernelError(
+            "resampling: a table and samples of two dimensions are needed, and no count below 0"
         )
-    )  # fmt: skip
+    mics, length = samples.shape
+    taps = table.shape[1]
+    rows = np.empty((count, mics), _FLOAT32)
+    source, target = _pointer(samples, samples.shape), ffi.from_buffer(_FLOATS, rows)
+    filters = _pointer(table, (up, taps))
+    try:
+        code = lib.locagen_resample(filters, taps, up, down, at, source, mics, length, target, count)
+    except OverflowError as fault:
+        raise KernelError(f"resampling: {fault}") from fault
+    _check(code)
     return rows
 
 

@@ -73,7 +73,6 @@ class Pipeline:
             denoiser = _made_denoiser(settings)
         if _for_array(settings) != _for_array(self._settings):
             self._correlate, self._pick, self._locate = _made_for_array(settings)
-            self._repeats.forget()
             self._find_faults.apply(settings)
         self._denoise, self._mask = denoiser
         self._settings = settings
@@ -85,7 +84,6 @@ class Pipeline:
     def forget_noise(self) -> None:
         """Learns background and noise from nothing: call it between two frames."""
         self._locate.forget()
-        self._repeats.forget()
         self._denoise, self._mask = _made_denoiser(self._settings)
         self._detect.forget()
 

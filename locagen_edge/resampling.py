@@ -6,7 +6,7 @@ work in blocks (soxr's hold sound back for 12 to 75 ms, and let frames come in t
 output sample k belongs to time k / rate_out, so time needs no correction. All microphones share one filter
 and one phase, so no delay between them is made up.
 
-Up to 0.94 of the lower rate's Nyquist frequency sound passes, within 0.003 %; what is folded in from beyond
+Up to 0.94 of the lower rate's Nyquist frequency sound passes, within 0.004 %; what is folded in from beyond
 lies above that, and above any band that is listened to by default.
 
 A sample that is not finite spoils the filter's length of its own microphone (9.6 ms from 48 kHz) and nothing
@@ -21,16 +21,23 @@ from fractions import Fraction
 import numpy as np
 
 from locagen_edge import kernel
+from locagen_edge.errors import SourceError
 from locagen_edge.types import F32
 
 PASS = 0.94
-"""of the lower Nyquist frequency; what lies above it by more than as much again is gone"""
+"""of the lower Nyquist frequency; by as much above it, all has been taken away"""
 ATTENUATION_DB = 90.0
 """The converter's noise is no farther down."""
+MOST_TAPS = 8_000_000
+"""32 MB. 44.1 kHz and 10 kHz take 37 thousand, 44,101 Hz and 10 kHz 4.6 million."""
+AT_ONCE = 64
 
 
 class Resampler:
-    """Rows (n, mics) float32 at `rate_in` to rows at `rate_out`; how they are cut does not show."""
+    """Rows (n, mics) float32 at `rate_in` to rows at `rate_out`; how they are cut does not show.
+
+    Raises `SourceError` for rates whose ratio takes numbers too large to be kept.
+    """
 
     def __init__(self, rate_in: float, rate_out: float, mics: int) -> None:
         ratio = Fraction(rate_out) / Fraction(rate_in)
@@ -38,6 +45,11 @@ class Resampler:
         self._same = ratio == 1
         cutoff = min(float(ratio), 1.0)
         self._half = 0 if self._same else _half(cutoff)
+        if self._up * 2 * self._half > MOST_TAPS:
+            raise SourceError(
+                f"{rate_in:g} Hz cannot be made {rate_out:g} Hz (audio.rate_hz): the two have too little in "
+                "common; choose a rate that shares a larger divisor"
+            )
         self._table = _filters(self._up, self._half, cutoff)
         self._mics = mics
         self.clear()
@@ -91,9 +103,12 @@ def _half(cutoff: float) -> int:
 
 def _filters(up: int, half: int, cutoff: float) -> F32:
     """(up, 2 * half): the filter as it stands for a sample out that lies phase / up after one in."""
-    behind = np.arange(1 - half, half + 1) - np.arange(up)[:, np.newaxis] / up  # samples in
     beta = 0.1102 * (ATTENUATION_DB - 8.7)
-    inside = np.sqrt(np.maximum(1.0 - (behind / max(half, 1)) ** 2, 0.0))
-    filters = np.sinc(cutoff * behind) * np.i0(beta * inside)
-    filters /= filters.sum(axis=1, keepdims=True)
-    return filters.astype(np.float32)
+    table: F32 = np.empty((up, 2 * half), dtype=np.float32)
+    for first in range(0, up, AT_ONCE):  # of odd rates there are many
+        phases = np.arange(first, min(first + AT_ONCE, up))
+        behind = np.arange(1 - half, half + 1) - phases[:, np.newaxis] / up  # samples in
+        inside = np.sqrt(np.maximum(1.0 - (behind / max(half, 1)) ** 2, 0.0))
+        filters = np.sinc(cutoff * behind) * np.i0(beta * inside)
+        table[phases] = filters / filters.sum(axis=1, keepdims=True)
+    return table

@@ -651,7 +651,7 @@ class LogSettings:
     )  # fmt: skip
     part_mb: float = setting(10.0, "One part.", unit="MB", least=0.001, most=1000)
     sync_s: float = setting(
-        2.0, "What a loss of power costs at most, of bearings; events are forced to the disk at once.",
+        2.0, "What a loss of power costs at most, of bearings; events are on the disk within 0.3 s.",
         unit="s", least=0.1, most=60,
     )  # fmt: skip
     snippets: bool = setting(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from locagen_edge import kernel
 from locagen_edge.alignment import Aligner
-from locagen_edge.errors import KernelError
+from locagen_edge.errors import KernelError, SourceError
 from locagen_edge.framing import Framer, in_real_time
 from locagen_edge.resampling import Resampler
 from locagen_edge.types import Frame
@@ -195,6 +195,19 @@ def test_the_kernels_filter_is_its_definition(data, seed):
     if count:
         with pytest.raises(KernelError, match="samples enough"):
             kernel.resample(table, up, down, at, np.ascontiguousarray(samples[:, :-1]), count)
+
+
+def test_rates_that_have_nothing_in_common_are_refused_by_name():
+    with pytest.raises(SourceError, match="191999 Hz cannot be made 10007 Hz"):
+        Resampler(191_999, 10_007.0, 3)
+
+
+@pytest.mark.parametrize("wrong", [{"count": -1}, {"at": 2**40}, {"samples": np.zeros(32, np.float32)}])
+def test_what_the_kernel_cannot_filter_is_refused(wrong):
+    table, samples = np.ones((1, 16), np.float32), np.zeros((2, 32), np.float32)
+    asked = {"table": table, "up": 1, "down": 1, "at": 0, "samples": samples, "count": 1} | wrong
+    with pytest.raises(KernelError):
+        kernel.resample(**asked)
 
 
 def test_clear_forgets():

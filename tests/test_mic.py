@@ -220,6 +220,7 @@ class FakeCard:
         self.done = 0
         self.flag = False
         self.script = {}  # poll number: what happens then
+        self.latency = 4 * LATEST_S
 
     def now_ns(self):
         return self.now

@@ -156,7 +156,7 @@ def test_no_numbers_and_silence_are_nobody_and_spoil_nothing(fault: float) -> No
 
 def test_what_was_heard_in_other_noise_or_other_axes_does_not_count() -> None:
     rng = np.random.default_rng(1)
-    for between in ("noise", "axes", "gap"):
+    for between in ("nothing", "noise", "axes", "gap"):
         repeats = Repeats(SETTINGS)
         for frame in range(4 * PAUSE_FRAMES):
             repeats(
@@ -166,7 +166,21 @@ def test_what_was_heard_in_other_noise_or_other_axes_does_not_count() -> None:
             repeats(noise(rng), None, HOP_S)
         elapsed_s = 600.0 if between == "gap" else HOP_S
         attitude = turned(0.0) if between == "axes" else None
-        assert repeats(noise(rng) + lobe(9.0), NOTHING, elapsed_s, attitude) is None, between
+        again = repeats(noise(rng) + lobe(9.0), NOTHING, elapsed_s, attitude)
+        assert (again is None) == (between != "nothing"), between
+
+
+def test_a_heading_that_is_lost_for_a_moment_costs_only_that_moment() -> None:
+    rng = np.random.default_rng(1)
+    repeats, told, lost = Repeats(SETTINGS), 0, 0
+    for frame in range(5 * PAUSE_FRAMES):
+        calls = frame % PAUSE_FRAMES < 2 * CALL_FRAMES
+        heading = None if 20 <= frame % 50 < 25 else turned(0.3)
+        bearing = repeats(noise(rng) + (lobe(9.0) if calls else 0.0), NOTHING, HOP_S, heading)
+        told += bearing is not None
+        lost += bearing is not None and heading is None
+    assert told > 0
+    assert lost == 0
 
 
 # --- through the pipeline ---------------------------------------------------------------------------------
@@ -198,13 +212,3 @@ def test_the_fifth_call_is_found_that_alone_is_too_faint(seed: int) -> None:
     last = last_second(SETTINGS, sound)[-1]
     assert last.track is not None
     assert math.degrees(last.track.azimuth_rad) == pytest.approx(math.degrees(1.0), abs=4.0)
-
-
-def test_what_is_forgotten_of_the_noise_is_forgotten_of_callers() -> None:
-    sound = five_calls(-8.0, 2)
-    frames = cut(SETTINGS, sound)
-    pipeline = Pipeline(SETTINGS)
-    for frame in frames[:-30]:
-        pipeline.process(frame)
-    pipeline.forget_noise()
-    assert not any(pipeline.process(frame).detection.call for frame in frames[-30:])

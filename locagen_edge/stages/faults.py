@@ -178,7 +178,7 @@ def between(pairs: tuple[tuple[int, int], ...], verdicts: list[str | None], mics
 
 def alone(frame: Frame, correlation: Correlation, clipped: int) -> tuple[set[str], set[int]]:
     """What is wrong with channels by themselves, in words, and which of them hear; microphones counted from 0
-    as in the settings. `clipped`: bit m says that the converter has cut microphone m off of late."""
+    as in the settings. `clipped`: bit m says that the converter has cut microphone m off."""
     samples = frame.samples
     mics = range(len(samples))
     broken = {m for m in mics if correlation.bad_mics >> m & 1}
@@ -208,6 +208,12 @@ def alone(frame: Frame, correlation: Correlation, clipped: int) -> tuple[set[str
     return found, set(live)
 
 
+def _mostly(masks: list[int]) -> int:
+    """The bits that are set in more than half of them."""
+    every = max(mask.bit_length() for mask in masks)
+    return sum(1 << m for m in range(every) if 2 * sum(mask >> m & 1 for mask in masks) > len(masks))
+
+
 def _same(a: F32, b: F32) -> bool:
     """Whether one is the other, but for its level and sign."""
     aa, bb, ab = float(a @ a), float(b @ b), float(a @ b)
@@ -224,7 +230,8 @@ class FaultFinder:
         self._between: set[str] = set()
         """texts of faults between channels that have been seen"""
         self._audit_s = AUDIT_S
-        self._clipped = 0
+        self._clipped: list[int] = []
+        """of the frames since the last audit"""
         self._verdicts: list[str | None] = [None] * len(self._wide.pairs)
         """the latest of each pair: a frame may tell of some pairs only"""
 
@@ -243,12 +250,12 @@ class FaultFinder:
     ) -> tuple[str, ...]:
         """`elapsed_s`: since the previous frame."""
         self._audit_s += elapsed_s
-        self._clipped |= frame.clipped
+        self._clipped.append(frame.clipped)
         if self._audit_s >= AUDIT_S:
+            found, live = alone(frame, correlation, _mostly(self._clipped))
+            self._clipped.clear()
+            self._follow(found, self._share.keys() - self._between, self._audit_s)
             elapsed_s, self._audit_s = min(self._audit_s, 2 * AUDIT_S), 0.0
-            found, live = alone(frame, correlation, self._clipped)
-            self._clipped = 0
-            self._follow(found, self._share.keys() - self._between, elapsed_s)
             if (common := self._common(frame, tdoa, live, found)) is not None:
                 self._between |= common
                 self._follow(common, self._share.keys() & self._between, elapsed_s)

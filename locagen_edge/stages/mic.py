@@ -43,7 +43,8 @@ from locagen_edge.types import Array, Frame, Pose
 log = logging.getLogger(__name__)
 
 POLL_S = 0.005  # between questions to a card that has nothing new: its pointer may move in steps
-SOONEST_S, LATEST_S = 0.002, 0.1  # until the next question to one that had; its buffer is four times as long
+SOONEST_S, LATEST_S = 0.002, 0.1
+"""Until the next question to a card that had something; no more than a quarter of its buffer either."""
 LATENCY_S = 0.4  # the card's buffer: what may pile up while this process does not get to run; delays nothing
 CARDS = Path("/proc/asound")  # where the kernel tells its cards' ids
 TURN_S = 0.5  # what one turn of waiting counts at most: a process that was suspended has not waited
@@ -260,6 +261,10 @@ class InputStream(Protocol):
     """What `capture` needs of a sounddevice.InputStream without a callback."""
 
     @property
+    def latency(self) -> float:
+        """Seconds that its buffer holds."""
+
+    @property
     def read_available(self) -> int: ...
 
     def read(self, frames: int) -> tuple[Array, bool]: ...
@@ -282,6 +287,7 @@ def capture(
     samples = 0
     quiet_ns = 0
     asked_ns = now_ns()
+    latest_s = max(min(LATEST_S, stream.latency / 4), POLL_S)
     wait_s = POLL_S
     while not wait(wait_s):
         before_ns, asked_ns = asked_ns, now_ns()
@@ -307,7 +313,7 @@ def capture(
         cutter.framer.origin_ns = clock.origin_ns
         for frame in cutter.push(rows):
             yield frame if clock.drift is None else replace(frame, drift=clock.drift)
-        wait_s = min(max(cutter.missing / rate_hz, SOONEST_S), LATEST_S)
+        wait_s = min(max(cutter.missing / rate_hz, SOONEST_S), latest_s)
 
 
 def _portaudio() -> ModuleType:

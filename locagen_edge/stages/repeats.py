@@ -44,6 +44,8 @@ NEAR = 2
 """Columns to each side that the bearing is the mean of."""
 LONGEST_STEP_S = 0.2
 """After a gap one frame still counts as one."""
+LOST_S = 5.0
+"""Without a heading for so long, directions are the body's; for less nothing is added up."""
 SIGMA_RAD = math.radians(3.0)
 """Of a bearing: 68 % within 2.2 degrees, 95 % within 5.4, beside simulated rotors (`docs/denoise.md`)."""
 NOWHERE_RAD = math.pi / math.sqrt(3.0)
@@ -66,6 +68,7 @@ class Repeats:
         self._usual = self._weight = self._known_s = 0.0
         self._sums: F64 = np.zeros((1, 1))
         self._compass = False
+        self._lost_s = 0.0
 
     def __call__(
         self, scores: F32, evidence: Evidence | None, elapsed_s: float, attitude: Quaternion | None = None
@@ -79,7 +82,7 @@ class Repeats:
         if self._sums.shape != scores.shape:
             self._sums = np.zeros(scores.shape)
         self._follow(attitude is not None, elapsed_s)
-        if not np.isfinite(scores).all():
+        if self._compass is not (attitude is not None) or not np.isfinite(scores).all():
             return None
         middle = scores.size // 2
         above = (
@@ -87,17 +90,18 @@ class Repeats:
         )  # numpy's median takes 5 times as long
         best = float(above.max())
         usual = SCORE + (self._usual / self._weight if self._weight else 0.0)
-        self._learn(min(best, LOUDEST * usual), elapsed_s)
+        step_s = min(elapsed_s, LONGEST_STEP_S)
+        self._learn(min(best, LOUDEST * usual), step_s)
         if self._known_s < YOUNG_S or best <= LEAST * usual:
             return None
-        step_s = min(elapsed_s, LONGEST_STEP_S)
         added = step_s * np.clip(above / usual - LEAST, 0.0, MOST)
         turned = 0.0 if attitude is None else _heading(attitude) / (2.0 * math.pi) * scores.shape[1]
         self._sums += _turned(added, turned)
         return self._told(_turned(self._sums, -turned), added, evidence)
 
     def _follow(self, compass: bool, elapsed_s: float) -> None:
-        if compass is not self._compass:
+        self._lost_s = 0.0 if compass else self._lost_s + elapsed_s
+        if compass is not self._compass and (compass or self._lost_s > LOST_S):
             self._sums[:] = 0.0  # of other axes
             self._compass = compass
         self._sums *= math.exp(-elapsed_s / self._memory_s)

@@ -119,7 +119,7 @@ class BlackBox:
         self._called = 0
         self._faults: dict[str, int] = {}  # and when each was last there
         self._worker: Worker[_Heard | Record] = Worker(
-            "black box", WAITING, self._write, self._sync_if_due, self._end, self._sync_s
+            "black box", WAITING, self._write, self._sync_if_due, self._end, self._sync_s / 4
         )
         self._worker.put(
             _now("start", version=__version__, settings=dataclasses.asdict(settings)),
@@ -138,7 +138,7 @@ class BlackBox:
     def watch(self, **states: dict[str, Any]) -> None:
         """The daemon's states by name: a change makes a record of this type."""
         for name, state in states.items():
-            if self._states.get(name) != state and self._worker.put(_now(name, **state)):
+            if self._states.get(name) != state and self._worker.put(_now(name, **state), urgent=True):
                 self._states[name] = state
 
     def close(self, timeout_s: float) -> bool:

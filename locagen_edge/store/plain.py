@@ -19,9 +19,8 @@ from locagen_edge.geometry import compass_deg
 DIGITS = 6
 """significant: a microdegree of latitude is 0.1 m, so positions have more"""
 LONG = ("latitude_deg", "longitude_deg")
-
-
 AS_IT_IS = frozenset({type(None), bool, int, str})
+"""types that JSON has too"""
 
 
 def plain(value: Any) -> Any:

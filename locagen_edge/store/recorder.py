@@ -21,8 +21,8 @@ from locagen_edge.store.worker import Worker
 from locagen_edge.types import F64, Array
 
 MB = 1_000_000
-WAITING = 512
-"""blocks that may wait for the disk: 10 s of a sound card"""
+WAITING_S = 10.0
+"""sound that may wait for the disk"""
 CLOSE_S = 10.0
 """how long the end waits for a slow disk"""
 
@@ -81,8 +81,9 @@ class Recorder:
         if self._failure:
             raise StorageError(self._failure)
         self._worker: Worker[Block | bytes] = Worker(
-            "recorder", WAITING, self._write, self._sync_if_due, self._end, settings.record.sync_s
-        )
+            "recorder", WAITING_S, self._write, self._sync_if_due, self._end,
+            turn_s=settings.record.sync_s / 4, size=_seconds,
+        )  # fmt: skip
 
     # --- from the source's thread
 
@@ -215,3 +216,7 @@ class Recorder:
             self._failure = self._failure or f"{self._directory}: {error.strerror}: the recording ends here"
             with suppress(StorageError):  # else the next start in this folder mends it
                 recover(self._directory)
+
+
+def _seconds(item: Block | bytes) -> float:
+    return 0.0 if isinstance(item, bytes) else len(item.rows) / item.rate_hz

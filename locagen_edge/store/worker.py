@@ -30,17 +30,18 @@ class Worker(Generic[T]):
     def __init__(
         self,
         name: str,
-        most: int,
+        most: float,
         write: Callable[[T], None],
         turn: Callable[[], None],
         end: Callable[[], None],
         turn_s: float = TURN_S,
+        size: Callable[[T], float] = lambda _: 1.0,
     ) -> None:
         self.dropped = 0
         """items for which the queue had no room"""
         self.failure = ""
         """a fault of ours, in words"""
-        self._most = most
+        self._most, self._size, self._filled = most, size, 0.0
         self._queue: deque[T] = deque()
         self._write, self._turn, self._end = write, turn, end
         self._turn_s = min(turn_s, TURN_S)
@@ -56,14 +57,15 @@ class Worker(Generic[T]):
         """Items in the queue."""
         return len(self._queue)
 
-    def put(self, item: T) -> bool:
+    def put(self, item: T, *, urgent: bool = False) -> bool:
         """From any thread, without waiting. False: dropped and counted."""
         with self._lock:  # nothing comes in behind what `close` has promised to write
-            if self._closing or len(self._queue) >= self._most or not self._thread.is_alive():
+            if self._closing or self._filled >= self._most or not self._thread.is_alive():
                 self.dropped += 1
                 return False
             self._queue.append(item)
-        if len(self._queue) > self._most // 2:
+            self._filled += self._size(item)
+        if urgent or self._filled > self._most / 2:
             self._wake.set()
         return True
 
@@ -80,12 +82,18 @@ class Worker(Generic[T]):
             while not self._closing:
                 self._wake.wait(self._turn_s)
                 self._wake.clear()
-                while self._queue:
-                    self._write(self._queue.popleft())
+                self._write_all()
                 self._turn()
-            while self._queue:  # put just before `close`
-                self._write(self._queue.popleft())
+            self._write_all()  # put just before `close`
             self._end()
         except Exception as error:
             self.failure = f"{self._thread.name}: {error!r}: nothing more is written"
             log.exception("%s", self.failure)
+
+    def _write_all(self) -> None:
+        """What is in the queue now: what comes meanwhile waits for the next turn."""
+        for _ in range(len(self._queue)):
+            with self._lock:
+                item = self._queue.popleft()
+                self._filled -= self._size(item)
+            self._write(item)

@@ -338,7 +338,7 @@ class SteeredLocator:
         for span in range(len(self._spans_s)):
             if not quiet:
                 self._search.doubt(span)
-            elif not self._strange[span]:
+            elif not self._strange[span] and self._scores[span] is not None:  # it was searched
                 self._search.watch(span)
             if quiet and self._quiet_hops % self._lag == 0:
                 self._search.settle(1.0 - math.exp(-self._hop_s / WATCH_S), span)
