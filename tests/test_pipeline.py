@@ -475,6 +475,18 @@ def test_a_frame_after_a_gap_holds_nothing_of_what_was_before():
     assert any(e.bearing.azimuth_rad is not None for e in estimates)
 
 
+def test_rotors_after_a_gap_are_the_same_noise():
+    """Thirteen seconds of them, a minute unheard, five seconds of them."""
+    settings = Settings()
+    sound = 0.02 * rotor_sound(settings, 18.0, np.random.default_rng(1))
+    pipeline = Pipeline(settings)
+    for n, frame in enumerate(cut(settings, sound.astype(np.float32))):
+        gone_ns = 60 * 10**9 if n >= 250 else 0
+        estimate = pipeline.process(replace(frame, t_ns=frame.t_ns + gone_ns, overruns=int(n == 250)))
+        if n >= 250:
+            assert not estimate.detection.call
+
+
 # --- what is wrong with the microphones
 
 

@@ -144,7 +144,7 @@ class SteeredLocator:
         self._bad_hops = self._bad_hops + 1 if failing else 0
         self._failing.append(failing)
         self._silent.append(loudest < SILENCE)
-        self._elapsed_s = elapsed_s
+        self._elapsed_s = min(elapsed_s, LAG_S)  # to learn by: what a gap held was not heard
         self._mask = mask
         if elapsed_s > LAG_S:
             self._onsets.forget()
