@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -179,7 +180,7 @@ def test_a_disk_that_is_too_slow_loses_blocks_and_counts_them(tmp_path, monkeypa
     write = parts.Part.write
     monkeypatch.setattr(parts.Part, "write", lambda *a: gate.wait(20) and write(*a))
     recorder = Recorder(tmp_path, settings)
-    for number in range(round(recorders.WAITING_S * 10_000 / 512) + 40):
+    for number in range(math.ceil(recorders.WAITING_S * 10_000 / 512) + 40):
         recorder.block(np.full((512, 3), number, dtype=np.float32), 10_000, 0)
     assert recorder.progress().lost >= 39
     gate.set()
