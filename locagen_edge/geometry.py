@@ -58,6 +58,10 @@ def tangent(u: F64) -> F64:
     return np.array([[a, b, 0.0], [b * z, -a * z, a * y - b * x]])
 
 
+NOWHERE_RAD = math.pi / math.sqrt(3.0)
+"""1-sigma of an angle that may be anything: the standard deviation of a uniform one, 104 degrees."""
+
+
 def wrap(angle_rad: float) -> float:
     """The same angle within -pi (included) to pi (left out)."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
@@ -100,6 +104,12 @@ def rotation(q: Quaternion) -> F64:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def heading(q: Quaternion) -> float:
+    """Of the body's nose, radians clockwise from true north."""
+    w, x, y, z = q
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:

@@ -14,7 +14,6 @@ from locagen_edge.geometry import tolerance_rad
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing import make_locator
 from locagen_edge.stages.bearing.common import Locator
-from locagen_edge.stages.bearing.steered import SteeredLocator
 from locagen_edge.stages.correlation import Correlator
 from locagen_edge.stages.denoise import MASKERS, Masker, WaveDenoiser
 from locagen_edge.stages.detection import Detector
@@ -135,10 +134,8 @@ class Pipeline:
 
     def _again(self, bearing: Bearing, elapsed_s: float, attitude: Quaternion | None) -> Bearing | None:
         """Of somebody who has called before, by what this frame alone scores."""
-        if not isinstance(self._locate, SteeredLocator):
-            return None
-        _, scores = self._locate.scores(replace(bearing, span_s=0.0))
-        return self._repeats(scores, bearing.evidence, elapsed_s, attitude)
+        scores = self._locate.frame_scores()
+        return None if scores is None else self._repeats(scores, bearing.evidence, elapsed_s, attitude)
 
     def _looks(self, tracks: tuple[Track, ...], pose: Pose | None) -> Iterator[Sighting]:
         """This frame's own bearings of callers, those that went into their positions."""

@@ -15,6 +15,7 @@ from locagen_edge.geometry import (
     compass_deg,
     direction,
     equilateral,
+    heading,
     quaternion,
     rotation,
     slerp,
@@ -166,3 +167,8 @@ def test_slerp_turns_evenly_by_the_shorter_way(a, b, share):
     other = slerp(p, tuple(-x for x in q), share)
     if whole < math.pi - 1e-6:  # half a turn has two shorter ways
         np.testing.assert_allclose(rotation(other), rotation(mixed), atol=1e-6)
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
+def test_the_heading_is_the_yaw_however_the_vehicle_leans(roll: float, pitch: float, yaw: float) -> None:
+    assert abs(wrap(heading(quaternion(roll, pitch, yaw)) - yaw)) < 1e-6

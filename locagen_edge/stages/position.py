@@ -29,6 +29,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from locagen_edge import geodesy
+from locagen_edge.geometry import heading
 from locagen_edge.settings import PoseSettings, PositionSettings
 from locagen_edge.types import F64, Pose, Position, Sighting, TrueBearing
 
@@ -221,18 +222,11 @@ def sighting(
         azimuth_sigma_rad=look.azimuth_sigma_rad,
         elevation_rad=look.elevation_rad,
         elevation_sigma_rad=look.elevation_sigma_rad,
-        heading_rad=_heading(pose),
+        heading_rad=0.0 if pose.attitude is None else heading(pose.attitude),
         azimuth_bias_sigma_rad=math.hypot(math.radians(attitude.compass_deg), tolerance_rad),
         elevation_bias_sigma_rad=math.hypot(math.radians(attitude.tilt_deg), tolerance_rad),
         position_sigma_m=settings.gps_m,
     )
-
-
-def _heading(pose: Pose) -> float:
-    if pose.attitude is None:
-        return 0.0
-    w, x, y, z = pose.attitude
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 # --- what comes in ------------------------------------------------------------------------------------

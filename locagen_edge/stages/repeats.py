@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 
-from locagen_edge.geometry import rotation, wrap
+from locagen_edge.geometry import NOWHERE_RAD, heading, wrap
 from locagen_edge.settings import Settings
 from locagen_edge.types import F32, F64, Bearing, Evidence, Quaternion
 
@@ -48,7 +48,6 @@ LOST_S = 5.0
 """Without a heading for so long, directions are the body's; for less nothing is added up."""
 SIGMA_RAD = math.radians(3.0)
 """Of a bearing: 68 % within 2.2 degrees, 95 % within 5.4, beside simulated rotors (`docs/denoise.md`)."""
-NOWHERE_RAD = math.pi / math.sqrt(3.0)
 
 
 class Repeats:
@@ -85,9 +84,8 @@ class Repeats:
         if self._compass is not (attitude is not None) or not np.isfinite(scores).all():
             return None
         middle = scores.size // 2
-        above = (
-            scores - np.partition(scores, middle, axis=None)[middle]
-        )  # numpy's median takes 5 times as long
+        # the median; numpy's own takes five times as long
+        above = scores - np.partition(scores, middle, axis=None)[middle]
         best = float(above.max())
         usual = SCORE + (self._usual / self._weight if self._weight else 0.0)
         step_s = min(elapsed_s, LONGEST_STEP_S)
@@ -95,7 +93,7 @@ class Repeats:
         if self._known_s < YOUNG_S or best <= LEAST * usual:
             return None
         added = step_s * np.clip(above / usual - LEAST, 0.0, MOST)
-        turned = 0.0 if attitude is None else _heading(attitude) / (2.0 * math.pi) * scores.shape[1]
+        turned = 0.0 if attitude is None else heading(attitude) / (2.0 * math.pi) * scores.shape[1]
         self._sums += _turned(added, turned)
         return self._told(_turned(self._sums, -turned), added, evidence)
 
@@ -133,12 +131,6 @@ class Repeats:
             estimator=NAME,
             evidence=evidence,
         )
-
-
-def _heading(attitude: Quaternion) -> float:
-    """Of the body's nose, radians from north."""
-    nose = rotation(attitude)[:, 0]
-    return math.atan2(nose[1], nose[0])
 
 
 def _turned(values: F64, columns: float) -> F64:

@@ -59,8 +59,8 @@ def _degrees_of_place(value: Any) -> float | None:
 
 
 def _compass(value: Any) -> float | None:
-    return None if value is None or not math.isfinite(value) else plain(compass_deg(value))
+    return None if value is None else plain(compass_deg(value))
 
 
 def _degrees(value: Any) -> float | None:
-    return None if value is None or not math.isfinite(value) else plain(math.degrees(value))
+    return None if value is None else plain(math.degrees(value))

@@ -1,8 +1,8 @@
 """A thread that writes, behind a bounded queue: a slow disk never holds up sound or event loop.
 
-It looks every `TURN_S`, or more often where that is asked for, and writes all that has come since: a thread
-that woke up for each item would cost more than what it does for it. What finds the queue full is dropped and
-counted: the newest, because what is older is already promised.
+It looks every `turn_s`, at least every `TURN_S`, and writes all that has come since: a thread that woke up
+for each item would cost more than what it does for it. What finds the queue full is dropped and counted: the
+newest, because what is older is already promised.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Worker(Generic[T]):
         write: Callable[[T], None],
         turn: Callable[[], None],
         end: Callable[[], None],
-        turn_s: float = TURN_S,
+        turn_s: float,
         size: Callable[[T], float] = lambda _: 1.0,
     ) -> None:
         self.dropped = 0

@@ -9,9 +9,9 @@ from typing import Protocol
 
 import numpy as np
 
-from locagen_edge.geometry import MicArray
+from locagen_edge.geometry import NOWHERE_RAD, MicArray
 from locagen_edge.settings import Settings
-from locagen_edge.types import F64, Bearing, Evidence, Frame, Mask, Tdoa
+from locagen_edge.types import F32, F64, Bearing, Evidence, Frame, Mask, Tdoa
 
 Estimator = Callable[[Tdoa], Bearing]
 """From delays to a direction, frame by frame."""
@@ -26,6 +26,9 @@ class Locator(Protocol):
         """Of the sources in the frame, the strongest first; at least one, if only to say "no bearing".
         `elapsed_s`: since the previous frame. `mask`: what of the frame is a caller's; None: not known."""
         ...
+
+    def frame_scores(self) -> F32 | None:
+        """What the last frame alone scores, (elevations, azimuths); None where only delays are seen."""
 
     def settle(self, call: bool, /) -> None:
         """Told afterwards whether the frame was taken for a call."""
@@ -46,6 +49,9 @@ class OnDelays:
     def __call__(self, _: Frame, tdoa: Tdoa, __: float, ___: Mask | None = None, /) -> tuple[Bearing, ...]:
         return (self._estimate(tdoa),)
 
+    def frame_scores(self) -> None:
+        """Directions are not searched."""
+
     def settle(self, _: bool, /) -> None:
         """Nothing is learnt."""
 
@@ -55,9 +61,6 @@ class OnDelays:
     def forget(self) -> None:
         """Nothing was learnt."""
 
-
-NOWHERE_RAD = math.pi / math.sqrt(3.0)
-"""1-sigma of an angle that may be anything: the standard deviation of a uniform one, 104 degrees."""
 
 LARGEST_AZIMUTH_SIGMA_RAD = math.radians(60.0)
 """Beyond this the answer is "no bearing"."""

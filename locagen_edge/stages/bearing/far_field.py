@@ -18,11 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from locagen_edge.geometry import FLAT_M, angles, tangent, wrap
+from locagen_edge.geometry import FLAT_M, NOWHERE_RAD, angles, tangent, wrap
 from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing.common import (
     LARGEST_AZIMUTH_SIGMA_RAD,
-    NOWHERE_RAD,
     DelayModel,
     Estimator,
     no_bearing,

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from locagen_edge.geometry import direction, wrap
+from locagen_edge.geometry import NOWHERE_RAD, direction, wrap
 from locagen_edge.settings import Settings
-from locagen_edge.stages.bearing.common import NOWHERE_RAD, DelayModel, Estimator, no_bearing
+from locagen_edge.stages.bearing.common import DelayModel, Estimator, no_bearing
 from locagen_edge.stages.bearing.far_field import far_field
 from locagen_edge.types import F64, Bearing, Fix, Tdoa
 

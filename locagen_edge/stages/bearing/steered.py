@@ -16,10 +16,10 @@ from collections import deque
 
 import numpy as np
 
-from locagen_edge.geometry import tolerance_rad
+from locagen_edge.geometry import NOWHERE_RAD, tolerance_rad
 from locagen_edge.kernel import Source, Steered
 from locagen_edge.settings import Settings
-from locagen_edge.stages.bearing.common import LARGEST_AZIMUTH_SIGMA_RAD, NOWHERE_RAD, no_bearing
+from locagen_edge.stages.bearing.common import LARGEST_AZIMUTH_SIGMA_RAD, no_bearing
 from locagen_edge.stages.bearing.evidence import Onsets, Usual
 from locagen_edge.types import F32, Bearing, Evidence, Frame, Mask, Tdoa
 
@@ -290,6 +290,10 @@ class SteeredLocator:
         """The best direction of a span's last frame, however little it stands out: to judge the search by."""
         found = self._search.search(1, span)
         return self._placed_at(found[0], span, None) if found else no_bearing(NAME)
+
+    def frame_scores(self) -> F32:
+        """(rows, columns) of the last frame alone."""
+        return self._search.map()
 
     def scores(self, bearing: Bearing) -> tuple[F32, F32]:
         """What a bearing of this frame was taken from: azimuths (columns,) and scores (rows, columns)."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from locagen_edge.geometry import wrap
+from locagen_edge.geometry import NOWHERE_RAD, wrap
 from locagen_edge.settings import Settings
-from locagen_edge.stages.bearing.common import NOWHERE_RAD, DelayModel, Estimator, no_bearing
+from locagen_edge.stages.bearing.common import DelayModel, Estimator, no_bearing
 from locagen_edge.types import Bearing, Tdoa
 
 

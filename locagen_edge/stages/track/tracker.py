@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from locagen_edge.geometry import angles, direction, rotation, tangent
+from locagen_edge.geometry import NOWHERE_RAD, angles, direction, rotation, tangent
 from locagen_edge.settings import PoseSettings, TrackSettings
 from locagen_edge.stages.track import filter as sphere
 from locagen_edge.stages.track.association import associate
@@ -43,8 +43,6 @@ ALIKE_RAD = math.radians(10.0)
 does not tell such two apart."""
 SWELL_S = 0.02
 """1-sigma of the moment within a frame of 0.1 s from which most of its sound comes."""
-NOWHERE_RAD = math.pi / math.sqrt(3.0)
-"""1-sigma of an angle that may be anything."""
 AS_IT_IS: F64 = np.eye(3)
 """body -> earth, where the attitude is not known"""
 
