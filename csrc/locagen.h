@@ -212,6 +212,11 @@ int locagen_steer_doubt(locagen_steer *state, int32_t span);
 /* Weights 0 to 1 of all bins, for the searches to come: each bin counts as so many looks less. */
 int locagen_steer_weigh(locagen_steer *state, const float *weight);
 
+/* Wiener's gain of each bin, 1 - noise / power and 0 or more (Wiener, Extrapolation, Interpolation, and Smoothing of
+ * Stationary Time Series, 1949, chapter 3), from the diagonals of the span's R_x and of R_n: power over noise is a mean
+ * over the microphones of both and over smooth_bins bins each side. 1 where nothing was heard or learnt. */
+int locagen_steer_gain(locagen_steer *state, int32_t span, float *gain);
+
 /* Bins in the band, and the number of the first. */
 int locagen_steer_bin_count(const locagen_steer *state);
 int locagen_steer_first_bin(const locagen_steer *state);

@@ -596,6 +596,40 @@ int locagen_steer_doubt(locagen_steer *memory, int32_t span)
     return LOCAGEN_OK;
 }
 
+int locagen_steer_gain(locagen_steer *memory, int32_t span, float *gain)
+{
+    steer *s;
+    locagen_span *x;
+    int error = find_span(memory, span, &s, &x);
+    if (error != LOCAGEN_OK)
+        return error;
+    if (gain == NULL)
+        return LOCAGEN_E_NULL;
+    int mics = s->learnt > 0 ? usable_mics(s, x) : 0, half = s->fine.half;
+    for (int k = 0; k < s->bins; k++)
+        s->q[k] = 0, gain[k] = 1;
+    if (mics == 0)
+        return LOCAGEN_OK;
+    float heard = (float)(1 / x->heard) / (float)__builtin_popcount((unsigned)mics), learnt = (float)(1 / s->learnt);
+    for (int m = 0; m < s->mics; m++) {
+        const float *signal = x->signal + m * (long)s->stride, *noise = s->noise + m * (long)s->stride;
+        for (int k = 0; k < s->bins && (mics >> m & 1); k++)
+            s->q[k] += heard * signal[k] / (learnt * noise[k] + s->floor);
+    }
+    double sum = 0; /* of those bins that the average holds */
+    for (int k = 0; k < half; k++)
+        sum += (double)s->q[k];
+    for (int k = 0; k < s->bins; k++) {
+        if (k + half < s->bins)
+            sum += (double)s->q[k + half];
+        if (k > half)
+            sum -= (double)s->q[k - half - 1];
+        double over = sum * (double)s->fine.share[k];
+        gain[k] = over > 1 ? (float)(1 - 1 / over) : 0;
+    }
+    return LOCAGEN_OK;
+}
+
 /* What the grid's bins are worth: looks, times the weight from outside. */
 static void count_coarse_bins(const steer *s, double t)
 {

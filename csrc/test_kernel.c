@@ -486,7 +486,16 @@ static void test_steered_angles(const locagen_steer_paths *chosen)
         CHECK(locagen_steer_noise(b.kernel, noise) == 0, "noise");
         CHECK(locagen_steer_axes(b.kernel, elevation, azimuth) == 0, "axes");
         CHECK(azimuth[0] == 0.0f && noise[0] > 0.0f, "azimuth %g, noise %g", (double)azimuth[0], (double)noise[0]);
-        free(bins), free(noise), free(elevation), free(azimuth);
+        float *gain = allocate(sizeof(float) * (size_t)b.bins), least = 1, most = 0;
+        CHECK(locagen_steer_gain(b.kernel, 1, gain) == 0 && gain[0] == 1.0f && gain[b.bins - 1] == 1.0f,
+              "nothing heard");
+        CHECK(locagen_steer_gain(b.kernel, 0, gain) == 0, "gains");
+        for (int k = 0; k < b.bins; k++)
+            least = gain[k] < least ? gain[k] : least, most = gain[k] > most ? gain[k] : most;
+        CHECK(least >= 0 && most > 0.5f && most <= 1, "gains from %g to %g", (double)least, (double)most);
+        locagen_steer_reset(b.kernel);
+        CHECK(locagen_steer_gain(b.kernel, 0, gain) == 0 && gain[0] == 1.0f, "nothing learnt");
+        free(bins), free(noise), free(elevation), free(azimuth), free(gain);
         steer_tear_down(&b);
     }
 }
@@ -638,6 +647,9 @@ static void test_steered_silence(const locagen_steer_paths *chosen)
     locagen_steer_hear(b.kernel, 0, 1.0f);
     CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 1, "a source over silence");
     CHECK(all_finite(b.sources) && off_by(b.sources, 1.0, -0.6) < 1, "%.2f degrees", off_by(b.sources, 1.0, -0.6));
+    float *gain = allocate(sizeof(float) * (size_t)b.bins);
+    CHECK(locagen_steer_gain(b.kernel, 0, gain) == 0 && gain[0] >= 0 && gain[0] <= 1, "over silence: %g", (double)gain[0]);
+    free(gain);
     locagen_steer_reset(b.kernel);
     CHECK(locagen_steer_search(b.kernel, 0, 1, 0, 0, b.sources) == 0, "forgotten");
     steer_tear_down(&b);
@@ -736,6 +748,7 @@ static void test_steered_refusals(void)
         CHECK(locagen_steer_doubt(b.kernel, span) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_search(b.kernel, span, 1, 0, 0, b.sources) == LOCAGEN_E_SPAN, "span %d", span);
         CHECK(locagen_steer_map(b.kernel, span, b.map) == LOCAGEN_E_SPAN, "span %d", span);
+        CHECK(locagen_steer_gain(b.kernel, span, b.map) == LOCAGEN_E_SPAN, "span %d", span);
     }
     CHECK(locagen_steer_watch(NULL, 0) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_settle(NULL, 0, 0.5f) == LOCAGEN_E_NULL, "no state");
@@ -743,6 +756,8 @@ static void test_steered_refusals(void)
     CHECK(locagen_steer_doubt(NULL, 0) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_weigh(NULL, b.in) == LOCAGEN_E_NULL, "no state");
     CHECK(locagen_steer_weigh(b.kernel, NULL) == LOCAGEN_E_NULL, "no weights");
+    CHECK(locagen_steer_gain(NULL, 0, b.map) == LOCAGEN_E_NULL, "no state");
+    CHECK(locagen_steer_gain(b.kernel, 0, NULL) == LOCAGEN_E_NULL, "no gains");
     b.in[1] = 1.01f;
     CHECK(locagen_steer_weigh(b.kernel, b.in) == LOCAGEN_E_WEIGHT, "a weight over 1");
     b.in[1] = NAN;

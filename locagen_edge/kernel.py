@@ -316,6 +316,16 @@ class Steered:
         """Weights 0 to 1 of all bins in the band, float32, shape `(bins,)`, for the searches to come."""
         _check(lib.locagen_steer_weigh(self._state, _pointer(weight, (len(self.frequency_hz),))))
 
+    def gain(self, span: int = 0) -> npt.NDArray[np.float32]:
+        """Wiener's gain of all bins in the band, 0 to 1, float32, shape `(bins,)`.
+
+        1 - noise / power of the span's signal over the noise, both as means over microphones and, as q, over
+        neighbouring bins; 1 where nothing was heard or learnt.
+        """
+        gain = np.empty(len(self.frequency_hz), _FLOAT32)
+        _check(lib.locagen_steer_gain(self._state, span, ffi.from_buffer(_FLOATS, gain)))
+        return gain
+
     def search(
         self, max_sources: int = 1, span: int = 0, least: float = 0.0, further: float = 0.0
     ) -> tuple[Source, ...]:

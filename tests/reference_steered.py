@@ -70,6 +70,19 @@ class Reference:
         level = np.trace(noise, axis1=1, axis2=2).real / mics + self.floor
         return noise + (self.loading * level + self.floor)[:, None, None] * np.eye(mics)
 
+    def gain(self, signal: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Wiener's, (bins,); noise as it was learnt"""
+        of_signal, of_noise = (np.einsum("kii->ki", matrix).real for matrix in (signal, noise))
+        over = self.smoothed((of_signal / (of_noise + self.floor)).mean(axis=1))
+        return np.maximum(1 - 1 / np.maximum(over, 1e-30), 0)
+
+    def smoothed(self, q: np.ndarray) -> np.ndarray:
+        """Means over the bins each side that there are."""
+        kernel = np.ones(2 * min(self.smooth, len(q) - 1) + 1)
+        middle = len(kernel) // 2
+        cut = slice(middle, middle + len(q))
+        return np.convolve(q, kernel)[cut] / np.convolve(np.ones(len(q)), kernel)[cut]
+
     def phases(self, u: np.ndarray) -> np.ndarray:
         """a (bins, mics) of direction u"""
         return np.exp(2j * np.pi * self.f[:, None] * (self.positions @ u) / self.speed)
@@ -89,12 +102,7 @@ class Reference:
             out = np.eye(b.shape[1]) - b[:, :, None] * b[:, None, :].conj()
             a = np.einsum("kij,kj->ki", out, a)
         q = np.einsum("ki,kij,kj->k", a.conj(), x, a).real / (np.abs(a) ** 2).sum(axis=1)
-        if self.smooth:
-            kernel = np.ones(2 * min(self.smooth, len(q) - 1) + 1)
-            middle = len(kernel) // 2
-            cut = slice(middle, middle + len(q))
-            q = np.convolve(q, kernel)[cut] / np.convolve(np.ones(len(q)), kernel)[cut]
-        q = np.maximum(q, 1)
+        q = np.maximum(self.smoothed(q), 1)
         looks = 1 / (1 / self.looks + 1 / self.noise_looks)
         return float(looks * (q - 1 - np.log(q)).sum())
 

@@ -124,6 +124,8 @@ def test_agrees_with_the_reference(configuration: tuple[np.ndarray, dict[str, An
     samples = (call + hiss(rng, mics, 0.02, frame)).astype(np.float32)
     (best,) = heard(found, samples)
     signal, loaded = reference.cross(reference.bins(samples)), reference.loaded(noise)
+    # Rounding of squares of float32 bins, in bins that the window leaves nearly empty.
+    np.testing.assert_allclose(found.gain(), reference.gain(signal, noise), atol=2e-3)
     score = reference.at(signal, loaded, best.azimuth_rad, best.elevation_rad)
     # float32 through two inverses; a null as deep as the loading loses that much of its digits.
     tolerance = max(1e-3, 4e-6 / changes["loading"])
@@ -808,6 +810,53 @@ def test_weights_choose_the_bins_that_count() -> None:
             whole.weigh(wrong.astype(np.float32))
     with pytest.raises(KernelError, match="float32"):
         whole.weigh(np.ones(3, np.float32))
+
+
+def test_the_gain_is_what_the_call_has_of_each_bin() -> None:
+    """1 - noise / power: of hiss that has become louder, and of a call in half of the band."""
+    rng = np.random.default_rng(7)
+    found = steered()
+    np.testing.assert_array_equal(found.gain(), 1.0)
+    learn(found, [hiss(rng) for _ in range(100)])
+    np.testing.assert_array_equal(found.gain(), 1.0)  # nothing was heard
+    for ratio in (2.0, 4.0, 100.0):
+        gains = []
+        for _ in range(20):
+            listen(found, hiss(rng, level=0.01 * math.sqrt(ratio)))
+            found.hear()
+            gains.append(found.gain())
+        # three microphones and thirteen bins: each power is known to 16 %, the noise to 2 %
+        assert np.mean(gains) == pytest.approx(1.0 - 1.0 / ratio, abs=0.03)
+        assert 0.0 <= np.min(gains) <= np.max(gains) <= 1.0
+    listen(found, hiss(rng) + wave(rng, 1.0, level=0.1, band_hz=(300.0, 2000.0)))
+    found.hear()
+    inside = found.frequency_hz < 1900.0
+    assert found.gain()[inside].min() > 0.9
+    assert found.gain()[found.frequency_hz > 2500.0].mean() < 0.15
+    found.reset()
+    np.testing.assert_array_equal(found.gain(), 1.0)
+
+
+@pytest.mark.parametrize("level", [0.0, np.nan, 1e15])
+def test_the_gain_knows_no_dead_microphone(level: float) -> None:
+    """The gain of the other two; where all are silent there is no call in any bin."""
+    rng = np.random.default_rng(8)
+    pyramid, left = steered(PYRAMID), steered(PYRAMID[[0, 1, 3]])
+    for n in range(40):
+        samples = hiss(rng, 4) + (wave(rng, 1.0, level=0.02, positions=PYRAMID) if n == 39 else 0.0)
+        for found, mics in ((pyramid, [0, 1, 2, 3]), (left, [0, 1, 3])):
+            broken = samples.copy()
+            broken[2] = level
+            with np.errstate(invalid="ignore"):
+                listen(found, broken[mics])
+            found.learn(1 / (n + 1)) if n < 39 else found.hear()
+    np.testing.assert_allclose(pyramid.gain(), left.gain(), atol=1e-6)
+    assert pyramid.gain().max() > 0.5
+    listen(pyramid, np.zeros((4, FRAME)))
+    pyramid.hear()
+    gain = pyramid.gain()
+    assert np.isfinite(gain).all()
+    assert gain.max() <= 1.0
 
 
 def test_a_narrow_sound_of_short_waves_has_rivals() -> None:
