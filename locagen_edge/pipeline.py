@@ -15,7 +15,7 @@ from locagen_edge.settings import Settings
 from locagen_edge.stages.bearing import make_locator
 from locagen_edge.stages.bearing.common import Locator
 from locagen_edge.stages.correlation import Correlator
-from locagen_edge.stages.denoise import MASKERS, Masker, WaveDenoiser
+from locagen_edge.stages.denoise import MaskDenoiser, WaveDenoiser
 from locagen_edge.stages.detection import Detector
 from locagen_edge.stages.faults import FaultFinder
 from locagen_edge.stages.position import Positioner, sighting
@@ -163,11 +163,13 @@ def _made_for_array(settings: Settings) -> tuple[Correlator, PeakPicker, Locator
     return Correlator(*shape), PeakPicker(*shape), make_locator(settings)
 
 
-def _made_denoiser(settings: Settings) -> tuple[WaveDenoiser | None, Masker | None]:
+def _made_denoiser(settings: Settings) -> tuple[WaveDenoiser | None, MaskDenoiser | None]:
     """What `denoise.kind` names: it cleans the sound, or it weighs the bearing's bins."""
     kind = settings.denoise.kind
-    make_mask = MASKERS.get(kind)
-    return WaveDenoiser(settings) if kind == "wave" else None, make_mask(settings) if make_mask else None
+    return (
+        WaveDenoiser(settings) if kind == "wave" else None,
+        MaskDenoiser(settings) if kind == "mask" else None,
+    )
 
 
 def _for_denoiser(settings: Settings) -> tuple[Any, ...]:
@@ -178,5 +180,5 @@ def _for_denoiser(settings: Settings) -> tuple[Any, ...]:
 def _for_array(settings: Settings) -> tuple[Any, ...]:
     """What those tables are made of: all that their stages read, less what `Locator.apply` takes."""
     s = settings
-    steered = replace(s.steered, span_s=1.0, forget_s=1.0)
+    steered = replace(s.steered, span_s=1.0, forget_s=1.0, weigh=True)
     return s.array, s.environment, s.correlation, s.bearing, s.models, steered

@@ -211,9 +211,8 @@ class DenoiseSettings:
         "none",
         "`wave`: every microphone's sound goes through the paper's network before it is correlated, and "
         "comes 6 ms later. `mask`: the sound stays as it is, and a network says which frequencies are the "
-        "caller's; `wiener`: the same from the spectrum of the noise alone, without a network. Both are for "
-        'bearing.estimator = "steered".',
-        choices=("none", "wave", "mask", "wiener"),
+        'caller\'s, for bearing.estimator = "steered".',
+        choices=("none", "wave", "mask"),
     )
     wave: str = setting("denoise-wave", "The model of `wave`.", pattern=NAME)
     mask: str = setting(
@@ -302,6 +301,11 @@ class SteeredSettings:
         "rotors whose tones wander, less hears between tones that keep still.",
         least=0,
         most=1,
+    )
+    weigh: bool = setting(
+        True,
+        "Callers are placed by those frequencies at which they stand out of the noise; whether something "
+        "calls is decided by all alike. Off: placed by all alike, which is less often right at -10 dB.",
     )
     forget_s: float = setting(
         4.0,
@@ -839,13 +843,13 @@ def _faults_of_array(s: Settings) -> Iterator[str]:
 
 
 def _faults_of_denoiser(s: Settings) -> Iterator[str]:
-    """Masks weigh spectra; the networks know one rate, and take the sound by 512 samples."""
-    if s.denoise.kind in ("mask", "wiener") and s.bearing.estimator != "steered":
+    """A mask weighs spectra; the networks know one rate, and take the sound by 512 samples."""
+    if s.denoise.kind == "mask" and s.bearing.estimator != "steered":
         yield (
             f"denoise.kind: {s.denoise.kind!r} needs bearing.estimator = 'steered': "
             f"{s.bearing.estimator!r} has no use for a mask"
         )
-    if s.denoise.kind not in ("wave", "mask"):
+    if s.denoise.kind == "none":
         return
     if s.audio.rate_hz != 10000:
         yield f"denoise.kind: {s.denoise.kind!r} needs audio.rate_hz = 10000, not {s.audio.rate_hz}"

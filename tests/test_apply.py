@@ -50,7 +50,7 @@ def test_a_threshold_changes_no_learnt_noise() -> None:
     other = changed(
         STEERED,
         detection={"snr_db": 3.0, "background_s": 5.0},
-        steered={"span_s": 1.0, "forget_s": 2.0},
+        steered={"span_s": 1.0, "forget_s": 2.0, "weigh": False},
         track={"coast_s": 1.0, "most": 2},
         pose={"compass_deg": 5.0},
         mavlink={"rate_hz": 5.0},

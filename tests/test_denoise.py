@@ -35,7 +35,6 @@ from locagen_edge.stages.denoise import (
     Presence,
     WaveDenoiser,
     WaveStream,
-    WienerDenoiser,
     decision_directed,
     finite,
 )
@@ -401,56 +400,6 @@ def test_noise_is_a_mean_at_first_and_then_forgotten() -> None:
     np.testing.assert_allclose(noise.mean, 7.0, rtol=1e-6)
 
 
-# --- Wiener -------------------------------------------------------------------------------------------
-
-WIENER = from_table({"denoise": {"kind": "wiener"}})
-
-
-def wiener_told() -> WienerDenoiser:
-    denoise = WienerDenoiser(WIENER)
-    in_wiener(denoise, rotors(100 * CHUNK, 1))
-    return denoise
-
-
-def in_wiener(denoise: WienerDenoiser, sound: np.ndarray) -> list:
-    """Masks of all frames, every one of which is settled as noise."""
-    masks = []
-    for frame in frames(sound):
-        masks.append(denoise(frame))
-        denoise.settle(False)
-    return masks
-
-
-def test_wieners_gain_of_white_sound_over_its_noise() -> None:
-    rng = np.random.default_rng(1)
-    denoise = WienerDenoiser(WIENER)
-    in_wiener(denoise, 0.01 * rng.standard_normal((MICS, 200 * CHUNK)))
-    for ratio in (2.0, 4.0, 100.0):  # power over noise: the gain is 1 - 1 / ratio
-        masks = [denoise(f) for f in frames(0.01 * ratio**0.5 * rng.standard_normal((MICS, 40 * CHUNK)))]
-        gain = np.mean([mask.weight for mask in masks])
-        assert gain == pytest.approx(1.0 - 1.0 / ratio, abs=0.03)  # 16 % a bin, 4 s of noise
-
-
-def test_wiener_keeps_the_whistle_and_not_the_rotors() -> None:
-    denoise = wiener_told()
-    rest = np.mean([mask.weight for mask in in_wiener(denoise, rotors(100 * CHUNK, 1)[:, -20 * CHUNK :])])
-    call = whistle(20 * CHUNK, 0.05)
-    mask = [denoise(frame) for frame in frames(rotors(20 * CHUNK, 2) + call)][-1]
-    loudest = int(np.abs(np.fft.rfft(call[-1024:])).argmax())
-    assert mask.weight[loudest] > 0.9 > 4.0 * rest
-    assert np.all((mask.weight >= 0.0) & (mask.weight <= 1.0))
-
-
-@pytest.mark.parametrize("fault", [0.0, np.nan, np.inf, 1e30])
-def test_wiener_passes_what_it_cannot_judge(fault: float) -> None:
-    fresh = WienerDenoiser(WIENER)
-    assert in_wiener(fresh, np.full((MICS, 20 * CHUNK), fault))[0].weight.min() == 1.0
-    denoise = wiener_told()
-    with np.errstate(all="raise"):
-        for mask in in_wiener(denoise, np.full((MICS, 4 * CHUNK), fault)):
-            assert np.isfinite(mask.weight).all()
-
-
 # --- settings -----------------------------------------------------------------------------------------
 
 
@@ -464,18 +413,10 @@ def test_what_the_networks_cannot_hear_is_refused(audio: dict, says: str) -> Non
     assert from_table({"audio": audio}).denoise.kind == "none"
 
 
-@pytest.mark.parametrize("kind", ["mask", "wiener"])
 @pytest.mark.parametrize("estimator", ["far-field", "hyperbolic", "model:tdoa-mlp"])
-def test_a_mask_is_for_the_estimator_that_weighs(kind: str, estimator: str) -> None:
-    with pytest.raises(SettingsError, match=f"denoise.kind: '{kind}' needs bearing.estimator = 'steered'"):
-        from_table({"denoise": {"kind": kind}, "bearing": {"estimator": estimator}})
-
-
-def test_wiener_takes_any_rate_and_hop() -> None:
-    audio = {"rate_hz": 16000, "frame": 2048, "hop": 256}
-    denoise = WienerDenoiser(from_table({"denoise": {"kind": "wiener"}, "audio": audio}))
-    frame = Framer(2048, 256, MICS, 16000).push(rotors(2048, 1).astype(np.float32))[0]
-    assert denoise(frame).weight.shape == (1025,)
+def test_a_mask_is_for_the_estimator_that_weighs(estimator: str) -> None:
+    with pytest.raises(SettingsError, match=r"'mask' needs bearing\.estimator = 'steered'"):
+        from_table({"denoise": {"kind": "mask"}, "bearing": {"estimator": estimator}})
 
 
 def test_one_microphone_more_is_the_same_network() -> None:

@@ -6,7 +6,6 @@
     mask    one mask for all microphones in time and frequency, from their spectra over that of the noise,
     which is learnt while nothing calls. It touches no phase: weigh cross-spectra with it, tell calls by it,
     or hear the cleaned sound, MASK_DELAY samples later.
-    wiener  the same kind of answer without a network: Wiener's gain of each bin of the frame's own spectrum.
 
 The networks hear everything through the same high-pass, keep their state from frame to frame, and begin anew
 after a gap. A sample that is not finite counts as silence inside, and is not finite again in the sound that
@@ -16,9 +15,7 @@ comes out, so that the microphone's failure is seen by those who look for it and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -406,64 +403,3 @@ class MaskDenoiser:
         """Learns the frame's new spectra as noise where it held no call."""
         if not call:
             self._stream.learn()
-
-
-# --- Wiener -------------------------------------------------------------------------------------------
-
-SMOOTH_BINS = 6
-"""Bins to each side over which power is averaged: with three microphones it varies by 16 % then."""
-
-
-class WienerDenoiser:
-    """Wiener's gain 1 - noise / power of each bin of a frame's own spectrum: what a network has to beat
-    (Wiener, *Extrapolation, Interpolation, and Smoothing of Stationary Time Series*, 1949, chapter 3).
-
-    Knows no past but the noise. `settle` as for the mask.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        audio = settings.audio
-        self._taper = np.sin(np.pi * (np.arange(audio.frame) + 0.5) / audio.frame) ** 2
-        self._noise = NoiseSpectrum(
-            settings.mic_array.mics, settings.denoise.forget_s / settings.hop_s, audio.frame // 2 + 1
-        )
-        self._earliest = EARLIEST_S / settings.hop_s
-        self._kernel = np.ones(2 * SMOOTH_BINS + 1)
-        self._of = np.convolve(np.ones(audio.frame // 2 + 1), self._kernel, "same")
-        low, high = settings.correlation.band_hz
-        frequency = np.fft.rfftfreq(audio.frame, 1.0 / audio.rate_hz)
-        self._band = (frequency >= low) & (frequency <= high)
-        self._power: F64 = np.zeros((settings.mic_array.mics, 1, audio.frame // 2 + 1))
-
-    def __call__(self, frame: Frame) -> Mask:
-        spectra = np.fft.rfft(finite(frame.samples) * self._taper)
-        self._power = (np.square(spectra.real) + np.square(spectra.imag))[:, np.newaxis]
-        heard = self._noise.relative(self._power, self._earliest)
-        if heard is None:
-            weight = np.ones(self._power.shape[2], dtype=np.float32)
-            return Mask(frame.t_ns, weight, weight[np.newaxis], -math.inf)
-        relative = np.convolve(heard[0][0], self._kernel, "same") / self._of
-        gain = np.maximum(1.0 - 1.0 / np.maximum(relative, 1e-9), 0.0)
-        power = self._power.mean(axis=(0, 1))[self._band]
-        call, rest = float(gain[self._band] @ power), float((1.0 - gain[self._band]) @ power)
-        weight = gain.astype(np.float32)
-        snr_db = 10.0 * math.log10((call + LEAST) / (rest + LEAST))
-        return Mask(frame.t_ns, weight, weight[np.newaxis], snr_db)
-
-    def settle(self, call: bool, /) -> None:
-        """Learns the frame as noise where it held no call."""
-        if not call:
-            self._noise.learn(self._power)
-
-
-class Masker(Protocol):
-    """What the pipeline asks for masks, once a frame."""
-
-    def __call__(self, frame: Frame, /) -> Mask: ...
-
-    def settle(self, call: bool, /) -> None:
-        """Told afterwards whether the frame was taken for a call."""
-
-
-MASKERS: dict[str, Callable[[Settings], Masker]] = {"mask": MaskDenoiser, "wiener": WienerDenoiser}
-"""By `denoise.kind`."""

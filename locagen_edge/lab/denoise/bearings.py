@@ -41,16 +41,16 @@ ELEVATION_RAD = math.radians(-20.0)
 LEVEL_DBFS = -35.0
 """in-band, of the noise"""
 
-METHODS: dict[str, tuple[str, str, float]] = {
-    "steered": ("none", "steered", -20.0),
-    "steered, Wiener weights": ("wiener", "steered", -20.0),
-    "steered, mask": ("mask", "steered", -20.0),
-    "PHAT": ("none", "far-field", -20.0),
-    "wave, then PHAT": ("wave", "far-field", -20.0),
-    "wave, then PHAT half whitened": ("wave", "far-field", -1.0),
+METHODS: dict[str, tuple[str, str, bool, float]] = {
+    "steered": ("none", "steered", True, -20.0),
+    "steered, all bins alike": ("none", "steered", False, -20.0),
+    "steered, mask": ("mask", "steered", True, -20.0),
+    "PHAT": ("none", "far-field", True, -20.0),
+    "wave, then PHAT": ("wave", "far-field", True, -20.0),
+    "wave, then PHAT half whitened": ("wave", "far-field", True, -1.0),
 }
-"""denoise.kind, bearing.estimator and correlation.relative_floor_db: at -1 dB bins below the mean fade out
-nearly as without whitening"""
+"""denoise.kind, bearing.estimator, steered.weigh and correlation.relative_floor_db: at -1 dB bins below the
+mean fade out nearly as without whitening"""
 
 
 Job = TypeVar("Job")
@@ -176,12 +176,13 @@ def sound_of(s: LabSettings, event: Event, field: str) -> tuple[F64, F64]:
 
 def pipeline(s: LabSettings, method: str) -> Pipeline:
     """The one that flies, with a method of METHODS."""
-    kind, estimator, floor_db = METHODS[method]
+    kind, estimator, weigh, floor_db = METHODS[method]
     return Pipeline(
         replace(
             s,
             denoise=replace(s.denoise, kind=kind),
             bearing=replace(s.bearing, estimator=estimator),
+            steered=replace(s.steered, weigh=weigh),
             correlation=replace(s.correlation, relative_floor_db=floor_db),
         )
     )

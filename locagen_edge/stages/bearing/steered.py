@@ -7,6 +7,11 @@ and divided out. The mathematics and its sources: `csrc/locagen.h`.
 
 Two averages of the signal are searched side by side, one frame and about a second. A loud caller is placed by
 the frame, anew each time; one too faint for that by the second, with what that takes from a drone that turns.
+
+Whether something calls is decided by all bins alike. Where it does, it is placed by another search, in which
+each bin counts by the square of Wiener's gain, which is what that leaves of its power: noise that comes from
+elsewhere than it did, and is no louder, says nothing then. At -10 dB that is right more often
+(`docs/denoise.md`).
 """
 
 from __future__ import annotations
@@ -106,6 +111,7 @@ class SteeredLocator:
         self._scores: list[float | None] = [None for _ in self._spans_s]  # the best, where it was looked for
         self._ratios = [0.0 for _ in self._spans_s]  # how those stand out
         self._strange = [False for _ in self._spans_s]
+        self._frame_scores: F32 = self._search.map()
         self._strange_hops = 0
         self._loud_hops_ago: int | None = None
         self._to_judge = 0  # the last frames, of which nobody knows yet whether they are noise
@@ -125,6 +131,7 @@ class SteeredLocator:
     def apply(self, settings: Settings, /) -> None:
         """Limit and memories as these settings say; what was learnt of the noise stays."""
         self._least_ratio = settings.detection.evidence
+        self._weigh = settings.steered.weigh
         self._spans_s = (0.0, settings.steered.span_s)
         self._forget_s = settings.steered.forget_s
         self._patience = settings.steered.forget_s / self._hop_s
@@ -170,7 +177,7 @@ class SteeredLocator:
             if span == 0 or self._onsets.going_on(towards):
                 evidence = Evidence(ratios[span], self._onsets.since_s(towards))
                 sources = found[span]
-                if self._mask is not None and ratios[span] >= self._least_ratio:
+                if (self._weigh or self._mask is not None) and ratios[span] >= self._least_ratio:
                     sources = self._placed(sources, span)
                 return tuple(self._told(source, span, evidence) for source in sources)
         return ()
@@ -203,6 +210,7 @@ class SteeredLocator:
         sources = self._sources(span)
         scores: F32 = self._search.map(span)
         if span == 0:
+            self._frame_scores = scores
             self._onsets.hear(scores)
         best = float(scores.max())
         if not sources:
@@ -227,9 +235,12 @@ class SteeredLocator:
     def _placed(self, found: list[Source], span: int) -> list[Source]:
         """Callers once more, by the bins that are theirs; as they were found where those hold too little.
 
-        Whether something calls has been decided without the mask, which can neither make a call nor hide one.
+        Whether something calls has been decided without weights: they can neither make a call nor hide one.
         """
-        self._search.weigh(self._weights[span])
+        weight = self._weights[span] if self._mask is not None else np.ones_like(self._weights[span])
+        if self._weigh:
+            weight = weight * np.square(self._search.gain(span))
+        self._search.weigh(weight)
         placed = self._sources(span)
         self._search.weigh(np.ones_like(self._weights[span]))
         too_little = len(placed) < len(found) or _may_be_elsewhere(placed[0])
@@ -292,8 +303,8 @@ class SteeredLocator:
         return self._placed_at(found[0], span, None) if found else no_bearing(NAME)
 
     def frame_scores(self) -> F32:
-        """(rows, columns) of the last frame alone."""
-        return self._search.map()
+        """(rows, columns) of the last frame alone, by all bins alike."""
+        return self._frame_scores
 
     def scores(self, bearing: Bearing) -> tuple[F32, F32]:
         """What a bearing of this frame was taken from: azimuths (columns,) and scores (rows, columns)."""
