@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -237,14 +238,25 @@ class SteeredLocator:
 
         Whether something calls has been decided without weights: they can neither make a call nor hide one.
         """
-        weight = self._weights[span] if self._mask is not None else np.ones_like(self._weights[span])
-        if self._weigh:
-            weight = weight * np.square(self._search.gain(span))
-        self._search.weigh(weight)
-        placed = self._sources(span)
+        for weight in self._ways_to_weigh(span):
+            self._search.weigh(weight)
+            placed = self._sources(span)
+            if len(placed) >= len(found) and not _may_be_elsewhere(placed[0]):
+                found = list(placed[: len(found)])
+                break
         self._search.weigh(np.ones_like(self._weights[span]))
-        too_little = len(placed) < len(found) or _may_be_elsewhere(placed[0])
-        return found if too_little else list(placed[: len(found)])
+        return found
+
+    def _ways_to_weigh(self, span: int) -> Iterator[F32]:
+        """Of all bins, best first: a mask may leave too little where the gain does not."""
+        mask = self._weights[span] if self._mask is not None else None
+        if self._weigh:
+            gain = np.square(self._search.gain(span))
+            if mask is not None:
+                yield mask * gain
+            yield gain
+        elif mask is not None:
+            yield mask
 
     def _nearest(self, source: Source) -> int:
         """On the grid."""
