@@ -23,10 +23,12 @@ from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 from peers import free_port
+from scenes import heard
 from test_daemon import running, source, until
 
+from locagen_edge.framing import as_captured
 from locagen_edge.pipeline import Pipeline
-from locagen_edge.settings import Settings, from_table
+from locagen_edge.settings import Settings, from_table, load
 from locagen_edge.sim.scene import frames as sim_frames
 from locagen_edge.stages.mic import wav_frames
 from locagen_edge.store import blackbox, flac, wav
@@ -282,6 +284,28 @@ def test_a_snippet_replays_to_its_sound_and_tells_of_a_gap(tmp_path):
     for a, b in zip(holed, again, strict=True):
         assert np.abs(a.samples - b.samples).max() <= 2.0**-23  # 24 bits
         assert a.t_ns - holed[0].t_ns == b.t_ns - again[0].t_ns
+
+
+def test_a_snippet_of_a_calibrated_array_replays_to_the_bearings_of_the_day(tmp_path):
+    """Channels that are late and loud are mended once: what was heard is told by the settings beside it."""
+    late = {"delays_s": [0.0, 50e-6, -30e-6], "gains_db": [0.0, 3.0, -2.0]}
+    sections = {"array": late, "audio": {"channel_map": [1, 2, 0]}, "bearing": {"estimator": "far-field"}}
+    captured = as_captured(heard(Settings(), 0.7, -0.5, 20.0, 20_480), (1, 2, 0))
+    soundfile.write(tmp_path / "day.wav", captured, 10_000, subtype="FLOAT")
+    settings = from_table({**sections, "log": {"snippets": True, "before_s": 30}})
+    pipeline, box = Pipeline(settings), BlackBox(tmp_path, settings, is_confirmed)
+    live = []
+    for number, each in enumerate(wav_frames(tmp_path / "day.wav", settings)):
+        live.append(pipeline.process(each).bearing.azimuth_rad)
+        box.hear(each, estimate(number, track=TRACK))
+    assert box.close(20)
+    (path,) = calls_of(tmp_path)
+    beside = load(path.with_suffix(".toml"))
+    assert replace(beside, array=settings.array) == settings
+    pipeline = Pipeline(beside)
+    again = [pipeline.process(each).bearing.azimuth_rad for each in wav_frames(path, beside)]
+    # 24 bits of FLAC: far less than a thousandth of a degree
+    np.testing.assert_allclose(np.degrees(again), np.degrees(live), atol=1e-3)
 
 
 def test_what_a_loss_of_power_left_is_packed_with_the_next_call(tmp_path):

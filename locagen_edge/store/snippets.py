@@ -2,6 +2,8 @@
 
 They hold the microphones at the processing rate, in the channels that `audio.channel_map` chooses them from,
 as FLAC once they are whole: `replay` reads them with the settings beside them. Time is that of the frames.
+
+Frames come with the channels' delays and gains taken out: the settings beside say that there are none left.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ class Snippets:
 
     def __init__(self, directory: Path, settings: Settings) -> None:
         self._directory = directory
-        self._settings = settings
+        array = replace(settings.array, delays_s=(), gains_db=())
+        self._settings = replace(settings, array=array)
         self._log = settings.log
         self._bound = Bound(directory, round(self._log.snippets_mb * MB), give_up_oldest=True)
         self._held: deque[Block] = deque()  # with `origin_ns` the time of its own first row
