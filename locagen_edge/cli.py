@@ -52,7 +52,10 @@ EXPORT_S = 5.0
 """How often `run --export` writes what is new."""
 EXPORT = "write callers to a map file, their places or bearings: .geojson, .kml or .gpx says the format"
 SERVICE_STATE = Path("/var/lib/locagen-edge")
-TYPES = ("start", "stop", "bearing", "call", "sighting", "fault", "link", "source", "losses", "lost")
+TYPES = (
+    *("start", "stop", "bearing", "call", "sighting", "fault", "link", "source", "losses"),
+    *("listening", "parameters", "lost"),
+)
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -179,7 +182,8 @@ def _parser() -> argparse.ArgumentParser:
     log = command(
         "log",
         _log,
-        "print the black box of `run`: calls, faults, links, losses, and on request every bearing",
+        "print the black box of `run`: calls, faults, links, losses, what was set in flight, and on request "
+        "every bearing",
         "A record that a loss of power has torn is passed over.",
     )
     log.add_argument(
@@ -384,7 +388,13 @@ async def _serve(
             recorder.gap(0)  # each time it is opened it begins anew
         return open_source(settings, recorder)
 
-    daemon = Daemon(settings, on_second=each_second, on_estimate=each_estimate, sources=source)
+    daemon = Daemon(
+        settings,
+        on_second=each_second,
+        on_estimate=each_estimate,
+        on_settings=None if recorder is None else recorder.apply,
+        sources=source,
+    )
     stopping.calls(daemon.stop)
     if not quiet:
         links = ", ".join(settings.mavlink.link)

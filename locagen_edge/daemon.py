@@ -72,8 +72,8 @@ class Daemon:
     """One source, one pipeline, one component on all its links.
 
     `on_second(daemon)` is called once per second of the main loop, `on_estimate(frame, estimate)` for each
-    frame; neither may wait. `sources` opens the source that the
-    settings name; a test passes its own.
+    frame, `on_settings(settings)` with those that are flown: before the source is opened, and whenever others
+    are applied; none may wait. `sources` opens the source that the settings name; a test passes its own.
     """
 
     def __init__(
@@ -82,6 +82,7 @@ class Daemon:
         *,
         on_second: Callable[[Daemon], None] | None = None,
         on_estimate: Callable[[Frame, Estimate], None] | None = None,
+        on_settings: Callable[[Settings], None] | None = None,
         sources: Callable[[Settings], AsyncGenerator[Frame, None]] = open_source,
     ):
         self.settings = settings
@@ -92,6 +93,7 @@ class Daemon:
         self.black_box: BlackBox | None = None
         self._on_second = on_second
         self._on_estimate = on_estimate
+        self._on_settings = on_settings
         self._sources = sources
         self._stopping = asyncio.Event()
         self._queue: asyncio.Queue[Frame | None] = asyncio.Queue()
@@ -121,6 +123,8 @@ class Daemon:
         for text in (*told, *faults):
             log.warning("%s", text)
         self._applied = self.settings
+        if self._on_settings is not None:
+            self._on_settings(self.settings)
         self.component = Component(
             self.settings.mavlink,
             pose=self.settings.pose,
@@ -292,6 +296,10 @@ class Daemon:
                 self.component.put_back(self._applied, f"Not applied: {error}")
             else:
                 self._applied = wanted
+                if self.black_box is not None:
+                    self.black_box.apply(wanted)
+                if self._on_settings is not None:
+                    self._on_settings(wanted)
                 log.info("settings by parameters: %s", self.component.parameters.changed or "none")
         self._applying = None
 
@@ -416,6 +424,8 @@ class Daemon:
                 "messages": self.links.dropped,
                 "sound_s": round(c.sound.lost_s, 1),
             },
+            "listening": {"on": self.component.listening},
+            "parameters": dict(self.component.parameters.changed),
         }
 
     def _tell_losses(self) -> None:

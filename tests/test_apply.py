@@ -17,9 +17,10 @@ from locagen_edge.daemon import Daemon
 from locagen_edge.errors import ModelError, SettingsError
 from locagen_edge.geometry import compass_deg
 from locagen_edge.mavlink.framer import Framer
-from locagen_edge.mavlink.parameters import kept, kept_file
+from locagen_edge.mavlink.parameters import keep, kept, kept_file
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings, from_table
+from locagen_edge.store.journal import records
 from locagen_edge.types import Frame
 
 STEERED = from_table({"bearing": {"estimator": "steered"}})
@@ -221,6 +222,33 @@ def test_a_parameter_is_applied_live_and_holds_after_a_restart(operator, tmp_pat
     asyncio.run(fly(False))
     found = [text for good, what, text in check(settings, 0.1) if what == "parameters" and good]
     assert any(text.startswith("track.coast_s is 7.5, not 2") for text in found)
+
+
+def test_recording_and_log_tell_what_is_flown(operator, tmp_path) -> None:
+    """What was kept from the flight before, and what is set in this one."""
+    settings = settings_of(operator, tmp_path, log={"directory": str(tmp_path / "log")})
+    keep(kept_file(settings), {"LG_ARRAY_YAW": 30.0})
+    flown: list[Settings] = []
+
+    async def test() -> None:
+        arguments = {"sources": source(settings), "on_settings": flown.append}
+        async with running(settings, **arguments) as daemon:
+            assert [s.array.mount_deg[2] for s in flown] == [30.0]
+            await until(lambda: operator.of("HEARTBEAT") and daemon.estimate)
+            operator.set("LG_TRK_COAST", 7.5)
+            operator.command(common.MAV_CMD_USER_1, 0.0)
+            await until(lambda: len(flown) == 2)
+            assert daemon.black_box._settings is flown[1]
+            states = daemon._states()
+            assert states["parameters"] == {"LG_ARRAY_YAW": 30.0, "LG_TRK_COAST": 7.5}
+            await until(lambda: not daemon.component.listening)
+            assert daemon._states()["listening"] == {"on": False}
+
+    asyncio.run(test())
+    assert flown[1].track.coast_s == 7.5
+    assert flown[1].array.mount_deg[2] == 30.0
+    start = next(records(tmp_path / "log"))
+    assert start["settings"]["array"]["mount_deg"] == [0.0, 0.0, 30.0]
 
 
 def test_setting_it_back_leaves_nothing_behind(operator, tmp_path) -> None:

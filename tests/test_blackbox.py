@@ -233,6 +233,27 @@ def test_states_are_kept_when_they_change(tmp_path):
     assert len([r for r in found if r["type"] == "source"]) == 1
 
 
+def test_what_was_set_and_commanded_in_flight_is_kept_in_words(tmp_path):
+    box = BlackBox(tmp_path, Settings(), is_confirmed)
+    for on, changed in (
+        (True, {}),
+        (True, {"LG_ARRAY_YAW": 90.0, "LG_TX_ADSB": 1.0}),
+        (False, {}),
+        (False, {}),
+    ):
+        box.watch(listening={"on": on}, parameters=changed)
+    assert box.close(20)
+    kinds = ("listening", "parameters")
+    words = [row(r).split("  ", 1)[1].split() for r in records(tmp_path) if r["type"] in kinds]
+    assert [" ".join(w) for w in words] == [
+        "listening listening",
+        "parameters as in the settings file",
+        "parameters LG_ARRAY_YAW 90, LG_TX_ADSB 1",
+        "listening told to stop listening",
+        "parameters as in the settings file",
+    ]
+
+
 def test_start_holds_the_settings(tmp_path):
     found = kept(tmp_path, [])
     assert from_table(found[0]["settings"]).log.directory == str(tmp_path)
@@ -306,6 +327,18 @@ def test_a_snippet_of_a_calibrated_array_replays_to_the_bearings_of_the_day(tmp_
     again = [pipeline.process(each).bearing.azimuth_rad for each in wav_frames(path, beside)]
     # 24 bits of FLAC: far less than a thousandth of a degree
     np.testing.assert_allclose(np.degrees(again), np.degrees(live), atol=1e-3)
+
+
+def test_a_snippet_has_the_settings_that_its_call_began_with(tmp_path):
+    settings = from_table({"log": {"snippets": True, "before_s": 0.5, "after_s": 0.2}})
+    turned = replace(settings, array=replace(settings.array, mount_deg=(0.0, 0.0, 90.0)))
+    box = BlackBox(tmp_path, settings, is_confirmed)
+    for number in range(90):
+        if number == 20:  # a call goes on from 10 to 30
+            box.apply(turned)
+        box.hear(frame(number), estimate(number, track=TRACK if number % 40 in range(10, 30) else None))
+    assert box.close(20)
+    assert [load(path.with_suffix(".toml")) for path in calls_of(tmp_path)] == [settings, turned]
 
 
 def test_what_a_loss_of_power_left_is_packed_with_the_next_call(tmp_path):

@@ -36,8 +36,7 @@ class Snippets:
 
     def __init__(self, directory: Path, settings: Settings) -> None:
         self._directory = directory
-        array = replace(settings.array, delays_s=(), gains_db=())
-        self._settings = replace(settings, array=array)
+        self._settings = settings
         self._log = settings.log
         self._bound = Bound(directory, round(self._log.snippets_mb * MB), give_up_oldest=True)
         self._held: deque[Block] = deque()  # with `origin_ns` the time of its own first row
@@ -48,6 +47,10 @@ class Snippets:
         self._origin_ns = 0  # time of the first row since the beginning or the last gap
         self._called_ns = 0  # when something was last calling
         self._synced_s = 0.0
+
+    def apply(self, settings: Settings) -> None:
+        """What stands beside a snippet that begins from here on. Bounds stay those of the beginning."""
+        self._settings = settings
 
     def hear(self, frame: Frame, utc: datetime, *, begins: bool, calling: bool) -> str:
         """Takes every frame, in order. Name of the snippet that it went into; empty: none.
@@ -105,7 +108,9 @@ class Snippets:
         self._bound.count()
         session = Session.begin(self._directory, utc)
         self._written_s = 0.0
-        self._part = Part(self._directory, session, block, PART_BYTES, self._settings)
+        array = replace(self._settings.array, delays_s=(), gains_db=())
+        settings = replace(self._settings, array=array)
+        self._part = Part(self._directory, session, block, PART_BYTES, settings)
         for number, held in enumerate(self._held):
             self._write(self._part, held, first=number == 0)
 
