@@ -19,6 +19,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -545,6 +546,8 @@ COLUMNS: dict[str, str] = {
     "faults": "",
 }
 """What one line of `replay` holds, and how the table prints it."""
+NOT_HEARD = {"mavlink", "flight", "daemon", "record", "log"}
+"""sections of the settings that are nothing to a replay"""
 
 
 def record(estimate: Estimate, t_s: float) -> dict[str, Any]:
@@ -598,11 +601,9 @@ def _caller_in_words(c: dict[str, Any]) -> str:
 def _replay(arguments: argparse.Namespace) -> int:
     files = _recordings(arguments.files)
     callers = _callers(arguments)
-    beside = files[0].with_suffix(".toml")
-    if arguments.settings is None and beside.is_file():
-        logging.info("settings: %s", beside)
-        arguments.settings = beside
-    settings = _settings(arguments)
+    settings = _settings_beside(files) if arguments.settings is None else None
+    if settings is None:
+        settings = _settings(arguments)
     if arguments.format == "table":
         print("  ".join(f"{name:>{_width(name)}}" for name in COLUMNS))
     for line in replay(files, settings, callers):
@@ -624,6 +625,31 @@ def _recordings(paths: list[Path]) -> list[Path]:
             raise SourceError(f"{path}: there is no WAV or FLAC in this folder")
         found += inside
     return found
+
+
+def _settings_beside(files: list[Path]) -> Settings | None:
+    """What all were recorded with; None where nothing tells. Raises `SourceError` where they differ."""
+    beside = [path for file in files if (path := file.with_suffix(".toml")).is_file()]
+    if not beside:
+        return None
+    settings = load(beside[0])
+    for path in beside[1:]:
+        if differ := list(_differ(settings, load(path))):
+            raise SourceError(
+                f"{path}: {', '.join(differ)} other than in {beside[0]}: replay them one by one, or give "
+                "--settings for all"
+            )
+    logging.info("settings: %s", beside[0])
+    return settings
+
+
+def _differ(a: Settings, b: Settings) -> Iterator[str]:
+    """Names of the settings that differ, of those that bearings depend on."""
+    for section in fields(Settings):
+        one, other = getattr(a, section.name), getattr(b, section.name)
+        for key in fields(one) if section.name not in NOT_HEARD else ():
+            if getattr(one, key.name) != getattr(other, key.name):
+                yield f"{section.name}.{key.name}"
 
 
 def replay(files: list[Path], settings: Settings, callers: Callers | None = None) -> Iterator[dict[str, Any]]:

@@ -137,6 +137,21 @@ def test_replay_obeys_the_settings(recording, tmp_path):
     assert np.median([line["azimuth_deg"] for line in lines]) == pytest.approx(57.0 - 120.0 + 360.0, abs=3.0)
 
 
+def test_recordings_of_other_settings_are_not_replayed_as_one(recording, tmp_path):
+    """A session of another yaw would be told by the first one's; links are nothing to a replay."""
+    for name, text in (("a", ""), ("b", "# another day\n[mavlink]\nrate_hz = 7\n"), ("c", "")):
+        (tmp_path / f"{name}.wav").write_bytes(recording.read_bytes())
+        (tmp_path / f"{name}.toml").write_text(f"{text}[bearing]\nestimator = 'far-field'\n")
+    done = cli("replay", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["estimator"] == "far-field"
+    (tmp_path / "c.toml").write_text("[bearing]\nestimator = 'far-field'\n[array]\nmount_deg = [0, 0, 90]\n")
+    says = f"{tmp_path}/c.toml: array.mount_deg other than in {tmp_path}/a.toml: replay them one by one"
+    fails(1, says, "replay", tmp_path)
+    done = cli("replay", tmp_path, "--settings", tmp_path / "c.toml")
+    assert done.returncode == 0, done.stderr
+
+
 def test_replay_ends_quietly_when_its_reader_does(recording):
     command = f"{sys.executable} -m locagen_edge replay {recording} | head -1"
     done = subprocess.run(
