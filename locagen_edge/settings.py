@@ -8,6 +8,7 @@ that one place, so they cannot disagree.
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import re
 import textwrap
@@ -998,7 +999,7 @@ def _toml(value: Any) -> str:
         return "[\n" + "".join(f"    {_toml(row)},\n" for row in value) + "]"
     formats: dict[type, Callable[[Any], str]] = {
         bool: lambda v: "true" if v else "false",
-        str: lambda v: '"' + v + '"',
+        str: lambda v: json.dumps(v, ensure_ascii=False).replace("\x7f", "\\u007f"),  # JSON lets DEL stand
         tuple: lambda v: "[" + ", ".join(_toml(item) for item in v) + "]",
     }
     return formats.get(type(value), repr)(value)
