@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import pty
+import shutil
 import socket
 import struct
 import subprocess
@@ -325,6 +326,29 @@ def test_check_goes_on_after_an_unfit_model(tmp_path):
     assert "WRONG  estimator: model absent" in done.stdout
     assert "ok     microphones" in done.stdout
     assert "link" in done.stdout
+
+
+@pytest.mark.parametrize("kind", ["mask", "wave"])
+def test_check_goes_on_without_a_denoiser_and_says_which_models_are_used(kind, tmp_path):
+    models = tmp_path / "models"
+    shutil.copytree(ROOT / "models", models)
+    (models / f"denoise-{kind}.onnx").write_bytes(b"torn")
+    (models / "tdoa-mlp.onnx").write_bytes(b"torn")
+    settings = tmp_path / "s.toml"
+    settings.write_text(f'[denoise]\nkind = "{kind}"\n[models]\ndirectory = "{models}"\n')
+    done = cli("check", "--seconds", "0.5", "--settings", settings)
+    assert done.returncode == 1
+    models_told = [line for line in done.stdout.splitlines() if "  models: " in line]
+    wrong = [line for line in models_told if line.startswith("WRONG")]
+    unused = [line for line in models_told if line.endswith("(not used)")]
+    assert len(wrong) == 1, done.stdout
+    assert f"denoise-{kind}" in wrong[0]
+    assert len(unused) == 1, done.stdout
+    assert "tdoa-mlp" in unused[0]
+    assert "ok     estimator: steered" in done.stdout
+    assert f"WRONG  denoiser: model denoise-{kind}" in done.stdout
+    assert "ok     microphones" in done.stdout
+    assert "link: " in done.stdout
 
 
 def test_check_knows_a_link_that_never_opened(tmp_path):
