@@ -61,12 +61,15 @@ TYPES = (
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `locagen-edge`."""
+    # started with them closed: what is opened next must not become them either
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     arguments = _parser().parse_args(argv)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(formatter(sys.stderr))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
-    if sys.stdout is None:  # started with it closed
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal without a degree sign is no reason to stop
     if arguments.command not in (_run, _record):  # these two run until they are stopped
@@ -632,7 +635,7 @@ def _settings_beside(files: list[Path]) -> Settings | None:
     beside = [path for file in files if (path := file.with_suffix(".toml")).is_file()]
     if not beside:
         return None
-    settings = load(beside[0])
+    settings: Settings = load(beside[0])
     for path in beside[1:]:
         if differ := list(_differ(settings, load(path))):
             raise SourceError(

@@ -249,6 +249,12 @@ def test_a_full_disk_is_one_line(recording, arguments):
 
 def test_closed_output_and_poor_terminals_are_borne(recording):
     assert shell(f"locagen-edge replay {recording} >&-").returncode == 0
+    done = shell(f"locagen-edge replay {recording} 2>&-")
+    assert done.returncode == 0
+    assert len(done.stdout.splitlines()) > 30
+    assert shell(f"locagen-edge replay {recording} >&- 2>&-").returncode == 0
+    assert shell("locagen-edge replay nowhere.wav 2>&-").returncode == 1
+    assert shell("locagen-edge replay 2>&-").returncode == 2
     done = shell("PYTHONIOENCODING=ascii locagen-edge run --seconds 1.5")
     assert done.returncode == 0, done.stderr
     assert "bearing" in done.stdout
