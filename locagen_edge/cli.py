@@ -794,9 +794,9 @@ def _log(arguments: argparse.Namespace) -> int:
         found: Iterable[Record] = chosen(records(directory), set(arguments.type), arguments.since)
         if arguments.last is not None:
             found = deque(found, arguments.last)
-        if arguments.format == "table":
-            print(HEADER)
-        for record in found:
+        for number, record in enumerate(found):
+            if arguments.format == "table" and number == 0:
+                print(HEADER)
             print(row(record) if arguments.format == "table" else json.dumps(record))
     except (FileNotFoundError, NotADirectoryError):
         raise StorageError(f"{directory}: there is no such folder; is log.directory set?") from None
