@@ -244,10 +244,17 @@ def _parser() -> argparse.ArgumentParser:
         "Put the array level in the open, motors off, and walk once or more all the way round it, a few "
         "metres away, with a loud broad-band sound (noise from a speaker, claps, speech) at its height. "
         "Prints what was found with its 1-sigma; exit code 1, and nothing is written, where the recording "
-        "could not determine it. The angle table has the columns time_s (of the recording), azimuth_deg "
-        "(clockwise from ahead) and maybe elevation_deg; between two lines the sound goes the shorter way.",
+        "could not determine it. The angle table has the columns time_s (of the recordings as one), "
+        "azimuth_deg (clockwise from ahead) and maybe elevation_deg; between two lines the sound goes the "
+        "shorter way.",
     )
-    calibrate.add_argument("file", type=Path, metavar="FILE.wav", help="WAV or FLAC, any rate, as recorded")
+    calibrate.add_argument(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="FILE.wav",
+        help="WAV or FLAC, any rate, as recorded; several, or a folder of them, are one after another",
+    )
     calibrate.add_argument("--write", type=Path, metavar="PATH", help="write settings with what was found")
     calibrate.add_argument("--angles", type=Path, metavar="CSV", help="where the sound was; default: unknown")
     calibrate.add_argument(
@@ -886,7 +893,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         angle_sigma_rad=math.radians(arguments.angle_sigma_deg),
     )
     table = None if arguments.angles is None else door.read_angles(arguments.angles)
-    heard = door.hear(arguments.file, settings, arguments.margin)
+    files = _recordings(arguments.files)
+    heard = door.hear(files, settings, arguments.margin)
     if table is not None:
         heard, walk = door.at_angles(heard, table, walk, arguments.angles)
     found = door.fitted(heard, settings, walk)
@@ -896,6 +904,6 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         written = ["nothing is written"] if arguments.write is not None else []
         raise CalibrationError("\n".join([*found.doubts, *written]))
     if arguments.write is not None:
-        door.write_settings(arguments.write, door.calibrated(settings, heard, found), arguments.file)
+        door.write_settings(arguments.write, door.calibrated(settings, heard, found), files)
         print(f"written     {arguments.write}")
     return 0
