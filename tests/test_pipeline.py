@@ -24,7 +24,7 @@ from scenes import (
 
 from locagen_edge.cli import replay
 from locagen_edge.errors import SettingsError, SourceError
-from locagen_edge.geometry import direction, quaternion, to_body, wrap
+from locagen_edge.geometry import angles, direction, quaternion, rotation, wrap
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings, from_table
 from locagen_edge.sim.calls import CALLS
@@ -349,7 +349,7 @@ def test_a_caller_stands_still_in_the_earths_axes_under_a_drone_that_turns(rate_
     for number in range(80):
         t_ns = 4_000_000_000 + number * 51_200_000
         attitude = quaternion(0.1, 0.05, math.radians(rate_deg_s) * number * settings.hop_s)
-        here = to_body(attitude, *caller)
+        here = angles(rotation(attitude).T @ direction(*caller))
         frame = Frame(heard(settings, *here, 20.0, 1024, seed=number), 10_000.0, t_ns, number * 512)
         estimate = pipeline.process(frame, Pose(t_ns + 51_200_000, attitude))
         assert estimate.pose.attitude == attitude
