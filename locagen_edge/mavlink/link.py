@@ -11,6 +11,7 @@ pymavlink's own `mavutil` would be shorter; it blocks, and it takes 186 ms and 3
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import logging
 import math
@@ -24,6 +25,7 @@ from types import MappingProxyType
 from typing import Any
 
 from locagen_edge.errors import LinkError
+from locagen_edge.mavlink.resolver import Resolver
 
 OPEN_S = 2.0
 """longest an attempt to open may take: TCP alone would try for two minutes, ever more seldom"""
@@ -91,6 +93,7 @@ class Link:
         self.spec = spec
         self._backoff_s = backoff_s
         self._on_bytes = on_bytes
+        self.addresses = Resolver(spec.target).addresses
         self._port: _Port | None = None
         self._told_up: bool | None = None
         self._opened = 0
@@ -361,33 +364,49 @@ class _UdpIn(_UdpOut):
 # --- openers ------------------------------------------------------------------------------------------
 
 
+async def _at_first(link: Link, opened: Callable[[tuple[str, int]], Awaitable[_Port]]) -> _Port:
+    """The port at the first of the host's addresses where one can be opened."""
+    *others, last = await link.addresses()
+    for address in others:
+        with contextlib.suppress(OSError):
+            return await opened((address, link.spec.number))
+    return await opened((last, link.spec.number))
+
+
 async def _open_udpout(link: Link) -> _Port:
-    address = (link.spec.target, link.spec.number)
     loop = asyncio.get_running_loop()
-    _, port = await loop.create_datagram_endpoint(lambda: _UdpOut(link), remote_addr=address)
-    return port
+
+    async def opened(address: tuple[str, int]) -> _Port:
+        return (await loop.create_datagram_endpoint(lambda: _UdpOut(link), remote_addr=address))[1]
+
+    return await _at_first(link, opened)
 
 
 async def _open_udpin(link: Link) -> _Port:
-    address = (link.spec.target, link.spec.number)
     loop = asyncio.get_running_loop()
-    _, port = await loop.create_datagram_endpoint(lambda: _UdpIn(link), local_addr=address)
-    return port
+
+    async def opened(address: tuple[str, int]) -> _Port:
+        return (await loop.create_datagram_endpoint(lambda: _UdpIn(link), local_addr=address))[1]
+
+    return await _at_first(link, opened)
 
 
 async def _open_tcp(link: Link) -> _Port:
     loop = asyncio.get_running_loop()
-    transport, port = await loop.create_connection(lambda: _Stream(link), link.spec.target, link.spec.number)
-    _bound_waiting(transport)
-    return port
+
+    async def opened(address: tuple[str, int]) -> _Port:
+        transport, port = await loop.create_connection(lambda: _Stream(link), *address)
+        _bound_waiting(transport)
+        return port
+
+    return await _at_first(link, opened)
 
 
 async def _open_tcpin(link: Link) -> _Port:
+    addresses = await link.addresses()
     port = _TcpIn(link)
     loop = asyncio.get_running_loop()
-    port.server = await loop.create_server(
-        lambda: _Accepted(port), link.spec.target, link.spec.number, backlog=1
-    )
+    port.server = await loop.create_server(lambda: _Accepted(port), addresses, link.spec.number, backlog=1)
     return port
 
 

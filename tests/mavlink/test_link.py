@@ -344,11 +344,11 @@ def test_a_refused_port_is_one_line_however_often_it_is_tried(caplog: pytest.Log
 def test_a_name_that_is_none_is_one_line(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def no_such_name(*_: Any, **__: Any) -> Any:
+    def no_such_name(*_: Any, **__: Any) -> Any:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
     async def test() -> None:
-        monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", no_such_name)
+        monkeypatch.setattr(socket, "getaddrinfo", no_such_name)
         async with running("tcp:no-such-host.invalid:5760") as (link, _):
             await until(lambda: link.last_error)
             assert link.last_error == "Name or service not known"
