@@ -419,6 +419,8 @@ class Daemon:
                 "frames": c.dropped,
                 "overruns": c.sound.overruns,
                 "messages": self.links.dropped,
+                "flooded_bytes": self.links.flooded_bytes,
+                "held_back": self.component.changes.held_back,
                 "sound_s": round(c.sound.lost_s, 1),
             },
         }
@@ -458,6 +460,10 @@ class Daemon:
         if not self.hearing:
             state = f"no sound: {self.source_fault or 'waiting'}"
         losses = f"{c.dropped} dropped, {c.sound}, {self.links.dropped} messages lost"
+        if self.links.flooded_bytes:
+            losses += f", {self.links.flooded_bytes} bytes of a flood not read"
+        if self.component.changes.held_back:
+            losses += f", {self.component.changes.held_back} commands or parameters held back"
         if self.black_box is not None and self.black_box.lost:
             losses += f", {self.black_box.lost} log records lost"
         faults = list(self.estimate.faults) if self.hearing and self.estimate is not None else []

@@ -30,7 +30,6 @@ FASTEST_US = 50_000
 """20 a second, as `mavlink.rate_hz` allows"""
 
 ACCEPTED: int = messages.MAV_RESULT_ACCEPTED
-REJECTED: int = messages.MAV_RESULT_TEMPORARILY_REJECTED
 DENIED: int = messages.MAV_RESULT_DENIED
 UNSUPPORTED: int = messages.MAV_RESULT_UNSUPPORTED
 

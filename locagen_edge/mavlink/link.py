@@ -96,15 +96,10 @@ class Link:
         self.addresses = Resolver(spec.target).addresses
         self._port: _Port | None = None
         self._told_up: bool | None = None
-        self._opened = 0
-        self.sent = 0
-        """frames handed to the system"""
-        self.sent_bytes = 0
         self.dropped = 0
         """frames that did not go: link down, nobody to send to, or too much waiting"""
-        self.received_bytes = 0
         self.flooded_bytes = 0
-        """of them dropped unread, because too much came"""
+        """bytes dropped unread, because too much came"""
         self._allowance = float(BURST)
         self._taken_s = -math.inf
         self.refused = 0
@@ -116,23 +111,15 @@ class Link:
         """Whether a frame sent now has somewhere to go."""
         return self._port is not None and self._port.ready
 
-    @property
-    def reopened(self) -> int:
-        """Times that the link was opened after the first."""
-        return max(0, self._opened - 1)
-
     def send(self, frame: bytes) -> bool:
         """Sends one frame, or drops and counts it. Never waits. True: it is on its way."""
         if self._port is None or not self._port.write(frame):
             self.dropped += 1
             return False
-        self.sent += 1
-        self.sent_bytes += len(frame)
         return True
 
     def take(self, data: bytes) -> None:
         """For the port: bytes have come."""
-        self.received_bytes += len(data)
         now_s = time.monotonic()
         self._allowance = min(self._allowance + (now_s - self._taken_s) * BYTES_PER_S, BURST)
         self._taken_s = now_s
@@ -161,7 +148,6 @@ class Link:
         except (OSError, ValueError) as error:  # ValueError: a baud rate or host name that cannot be
             self._tell_down(error)
             return False
-        self._opened += 1
         try:
             await asyncio.wait({port.lost}, timeout=STEADY_S)
             steady = not port.lost.done()
