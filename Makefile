@@ -105,7 +105,7 @@ build/test_threads: csrc/test_threads.c $(KERNEL_C) $(wildcard csrc/*.h)
 
 .PHONY: csrc-test-aarch64
 csrc-test-aarch64: ## the same for aarch64 under qemu-user
-	@command -v aarch64-linux-gnu-gcc qemu-aarch64-static >/dev/null || { echo "skipped: sudo apt install gcc-aarch64-linux-gnu qemu-user-static"; exit 0; }; \
+	@{ command -v aarch64-linux-gnu-gcc && command -v qemu-aarch64-static; } >/dev/null || { echo "skipped: sudo apt install gcc-aarch64-linux-gnu qemu-user-static"; exit 0; }; \
 	mkdir -p build && aarch64-linux-gnu-gcc $(CFLAGS_C) -O3 -static -Icsrc -o build/test_kernel_aarch64 csrc/test_kernel.c $(KERNEL_C) -lm && \
 	qemu-aarch64-static build/test_kernel_aarch64
 
