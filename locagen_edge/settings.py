@@ -529,8 +529,8 @@ class MavlinkSettings:
     state_directory: str = setting(
         "",
         "Folder where what was set over MAVLink (parameters.toml) and signing's last timestamp are kept over "
-        "restarts; empty: the service's state directory, /var/lib/locagen-edge under systemd, else "
-        "~/.local/state/locagen-edge.",
+        "restarts; empty: the service's state directory, /var/lib/locagen-edge (for `run` and `check` by "
+        "hand too, with the installed settings), else ~/.local/state/locagen-edge.",
     )
     send_records: bool = setting(
         True, "LOCAGEN_BEARING and LOCAGEN_POSITION: the whole record at once, for programs that know them."
