@@ -143,7 +143,7 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(BIN)/python bench/bench_pipeline.py
 	$(BIN)/python bench/bench_daemon.py
 	$(BIN)/python bench/bench_framer.py
-	$(BIN)/python bench/bench_accuracy.py --trials 100
+	$(BIN)/python bench/bench_accuracy.py
 	$(BIN)/python bench/bench_detection.py
 	$(BIN)/python bench/bench_twin.py
 	$(BIN)/python bench/bench_position.py
