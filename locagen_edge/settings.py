@@ -320,8 +320,8 @@ class DetectionSettings:
     evidence: float = setting(
         5.0,
         "Estimator `steered`: how many times what noise alone scores a direction has to score to be a call. "
-        "5 gives no false call in half an hour of rotors that hover, nor in two hours of rotors that hunt; "
-        "4 hears further.",
+        "5 gives no false call in an hour of rotors that hover, nor in one of rotors that hunt; 4 hears "
+        "further.",
         unit="times", least=1, most=1000,
     )  # fmt: skip
     repeats_s: float = setting(
