@@ -19,7 +19,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -324,6 +324,17 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     return load(DEFAULT_PATH) if DEFAULT_PATH.exists() else Settings()
 
 
+def _settings_in_service(arguments: argparse.Namespace) -> Settings:
+    """The settings; the service's, by hand too, with the state that the service keeps: what was set over
+    MAVLink holds, and is changed, where the service will find it."""
+    settings = _settings(arguments)
+    installed = arguments.settings in (None, DEFAULT_PATH) and DEFAULT_PATH.exists()
+    told = settings.mavlink.state_directory or os.environ.get("STATE_DIRECTORY")
+    if told or not installed or not SERVICE_STATE.is_dir():
+        return settings
+    return replace(settings, mavlink=replace(settings.mavlink, state_directory=str(SERVICE_STATE)))
+
+
 # --- run ----------------------------------------------------------------------------------------------
 
 
@@ -333,7 +344,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if notes:
         _put_off(Path(notes))
     one_arena()
-    settings = _settings(arguments)
+    settings = _settings_in_service(arguments)
     callers, recorder = _callers(arguments), None
     with contextlib.ExitStack() as ending:
         if callers is not None:
@@ -869,7 +880,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from locagen_edge.check import check
 
     wrong = 0
-    for good, what, text in check(_settings(arguments), arguments.seconds):
+    for good, what, text in check(_settings_in_service(arguments), arguments.seconds):
         print(f"{'ok   ' if good else 'WRONG'}  {what}: {text}", flush=True)
         wrong += not good
     if wrong:

@@ -290,8 +290,7 @@ class Daemon:
             try:
                 await loop.run_in_executor(self._executor, self.pipeline.apply, wanted)
             except Exception as error:  # whatever it is, the old settings go on listening
-                expected = isinstance(error, LocagenError)
-                log.error("parameters are not applied: %s", error, exc_info=not expected)
+                log.error("parameters are not applied: %s", error, exc_info=_unexpected(error))
                 self.settings = self._applied
                 self.component.put_back(self._applied, f"Not applied: {error}")
             else:
@@ -308,7 +307,13 @@ class Daemon:
 
     def _forget_noise(self) -> None:
         log.warning("the noise is learnt anew, as commanded over MAVLink")
-        self._executor.submit(self.pipeline.forget_noise)
+        forgetting = asyncio.get_running_loop().run_in_executor(self._executor, self.pipeline.forget_noise)
+        forgetting.add_done_callback(self._have_forgotten)
+
+    def _have_forgotten(self, done: asyncio.Future[None]) -> None:
+        if not done.cancelled() and (error := done.exception()):
+            log.error("the noise is not learnt anew: %s", error, exc_info=_unexpected(error))
+            self.component.tell_fault(f"Noise is not learnt anew: {error}")
 
     def _keep_parameters(self) -> None:
         """What was changed, on disk: a second later at most, and never on the loop that carries sound."""
@@ -422,6 +427,8 @@ class Daemon:
                 "frames": c.dropped,
                 "overruns": c.sound.overruns,
                 "messages": self.links.dropped,
+                "flooded_bytes": self.links.flooded_bytes,
+                "held_back": self.component.changes.held_back,
                 "sound_s": round(c.sound.lost_s, 1),
             },
             "listening": {"on": self.component.listening},
@@ -463,8 +470,17 @@ class Daemon:
         if not self.hearing:
             state = f"no sound: {self.source_fault or 'waiting'}"
         losses = f"{c.dropped} dropped, {c.sound}, {self.links.dropped} messages lost"
+        if self.links.flooded_bytes:
+            losses += f", {self.links.flooded_bytes} bytes of a flood not read"
+        if self.component.changes.held_back:
+            losses += f", {self.component.changes.held_back} commands or parameters held back"
         if self.black_box is not None and self.black_box.lost:
             losses += f", {self.black_box.lost} log records lost"
         faults = list(self.estimate.faults) if self.hearing and self.estimate is not None else []
         down = [f"link down: {self.links.last_error}"] if self.links.last_error else []
         return "; ".join([state, *faults, f"{c.estimates} frames, {losses}", *down, *self._complaints])
+
+
+def _unexpected(error: BaseException) -> BaseException | None:
+    """What the log has to tell the way of, not only in words."""
+    return None if isinstance(error, LocagenError) else error

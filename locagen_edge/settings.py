@@ -321,8 +321,8 @@ class DetectionSettings:
     evidence: float = setting(
         5.0,
         "Estimator `steered`: how many times what noise alone scores a direction has to score to be a call. "
-        "5 gives no false call in half an hour of rotors that hover, nor in two hours of rotors that hunt; "
-        "4 hears further.",
+        "5 gives no false call in an hour of rotors that hover, nor in one of rotors that hunt; 4 hears "
+        "further.",
         unit="times", least=1, most=1000,
     )  # fmt: skip
     repeats_s: float = setting(
@@ -530,8 +530,8 @@ class MavlinkSettings:
     state_directory: str = setting(
         "",
         "Folder where what was set over MAVLink (parameters.toml) and signing's last timestamp are kept over "
-        "restarts; empty: the service's state directory, /var/lib/locagen-edge under systemd, else "
-        "~/.local/state/locagen-edge.",
+        "restarts; empty: the service's state directory, /var/lib/locagen-edge (for `run` and `check` by "
+        "hand too, with the installed settings), else ~/.local/state/locagen-edge.",
     )
     send_records: bool = setting(
         True, "LOCAGEN_BEARING and LOCAGEN_POSITION: the whole record at once, for programs that know them."

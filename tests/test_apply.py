@@ -149,6 +149,22 @@ def test_forgotten_noise_is_learnt_anew() -> None:
     assert np.abs(pipeline._locate._search.noise()).max() > 0
 
 
+def test_noise_that_cannot_be_learnt_anew_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuses(_: Settings) -> None:
+        raise ModelError("model denoise-mask: the file is gone")
+
+    kept, untouched = Pipeline(STEERED), Pipeline(STEERED)
+    frames = cut(STEERED, noise(STEERED, 4.0))
+    for frame in frames:
+        kept.process(frame)
+        untouched.process(frame)
+    monkeypatch.setattr("locagen_edge.pipeline._made_denoiser", refuses)
+    with pytest.raises(ModelError):
+        kept.forget_noise()
+    assert np.array_equal(kept._locate._search.noise(), untouched._locate._search.noise())
+    assert kept._detect._minima == untouched._detect._minima
+
+
 # --- in the daemon ------------------------------------------------------------------------------------
 
 
@@ -284,6 +300,28 @@ def test_what_the_pipeline_cannot_do_is_put_back_and_told(operator, tmp_path, mo
         assert not kept_file(settings).exists()
 
     asyncio.run(test())
+
+
+@pytest.mark.parametrize("error", [ModelError("model x: it is gone"), MemoryError("no room")])
+def test_noise_that_is_not_learnt_anew_is_told(operator, tmp_path, monkeypatch, caplog, error) -> None:
+    settings = settings_of(operator, tmp_path)
+
+    def refuses() -> None:
+        raise error
+
+    async def test() -> None:
+        async with running(settings, sources=source(settings)) as daemon:
+            await until(lambda: operator.of("HEARTBEAT") and daemon.estimate)
+            monkeypatch.setattr(daemon.pipeline, "forget_noise", refuses)
+            operator.command(common.MAV_CMD_USER_2)
+            told = f"Noise is not learnt anew: {error}"
+            await until(lambda: any(m.text == told for m in operator.of("STATUSTEXT")))
+            estimates = daemon.counters.estimates
+            await until(lambda: daemon.counters.estimates > estimates + 3)
+
+    asyncio.run(test())
+    (line,) = [r for r in caplog.records if "not learnt anew" in r.getMessage()]
+    assert bool(line.exc_info) == isinstance(error, MemoryError), "what nobody expected, with its way"
 
 
 def test_a_folder_that_cannot_be_written_is_told(operator, tmp_path) -> None:

@@ -373,6 +373,40 @@ def test_check_knows_a_link_that_never_opened(tmp_path):
     assert "WRONG  link: " in done.stdout, done.stdout
 
 
+# --- the state of the service
+
+
+@pytest.mark.parametrize("given", [None, "settings", "others"])
+def test_by_hand_with_the_settings_of_the_service_what_it_was_told_over_mavlink_holds(tmp_path, given):
+    """The same flight as the service's, recorded by hand; other settings have nothing to do with it."""
+    installed, others, state = tmp_path / "settings", tmp_path / "others", tmp_path / "state"
+    for path in (installed, others):
+        path.write_text('[mavlink]\nlink = "udpout:127.0.0.1:9"\n')
+    state.mkdir()
+    (state / "parameters.toml").write_text("LG_TRK_COAST = 7.5\n")
+    at_hand = f"""
+import pathlib, sys
+from locagen_edge import cli
+cli.DEFAULT_PATH, cli.SERVICE_STATE = pathlib.Path({str(installed)!r}), pathlib.Path({str(state)!r})
+cli.main(sys.argv[1:])
+"""
+    said = []
+    for command in ("check", "run"):
+        settings = [] if given is None else ["--settings", tmp_path / given]
+        done = subprocess.run(
+            [sys.executable, "-c", at_hand, command, "--seconds", "0.5", *settings],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_STATE_HOME": str(tmp_path / "home")},
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        said.append(done.stdout + done.stderr)
+    holds = f"track.coast_s is 7.5, not 2: LG_TRK_COAST in {state}/parameters.toml"
+    assert [holds in text for text in said] == [given != "others"] * 2
+
+
 # --- devices
 
 
