@@ -105,7 +105,7 @@ build/test_threads: csrc/test_threads.c $(KERNEL_C) $(wildcard csrc/*.h)
 
 .PHONY: csrc-test-aarch64
 csrc-test-aarch64: ## the same for aarch64 under qemu-user
-	@command -v aarch64-linux-gnu-gcc qemu-aarch64-static >/dev/null || { echo "skipped: sudo apt install gcc-aarch64-linux-gnu qemu-user-static"; exit 0; }; \
+	@{ command -v aarch64-linux-gnu-gcc && command -v qemu-aarch64-static; } >/dev/null || { echo "skipped: sudo apt install gcc-aarch64-linux-gnu qemu-user-static"; exit 0; }; \
 	mkdir -p build && aarch64-linux-gnu-gcc $(CFLAGS_C) -O3 -static -Icsrc -o build/test_kernel_aarch64 csrc/test_kernel.c $(KERNEL_C) -lm && \
 	qemu-aarch64-static build/test_kernel_aarch64
 
@@ -143,7 +143,7 @@ bench: $(VENV)/.dev ## speed beside its peers, into bench/results/
 	$(BIN)/python bench/bench_pipeline.py
 	$(BIN)/python bench/bench_daemon.py
 	$(BIN)/python bench/bench_framer.py
-	$(BIN)/python bench/bench_accuracy.py --trials 100
+	$(BIN)/python bench/bench_accuracy.py
 	$(BIN)/python bench/bench_detection.py
 	$(BIN)/python bench/bench_twin.py
 	$(BIN)/python bench/bench_position.py

@@ -1,6 +1,6 @@
 """Accuracy of a bearing: every estimator of this project, pyroomacoustics', and the bound.
 
-    python bench/bench_accuracy.py [--trials 500] [--processes N] [--quick] [--only NAME ...] [--output FILE]
+    python bench/bench_accuracy.py [--trials 200] [--processes N] [--quick] [--only NAME ...] [--output FILE]
 
 Plain noise: a far caller on the horizon in the free field, exact fractional delays, noise of each
 microphone's own, SNR over 0 to half the rate, one frame of 0.1 s. Rotor noise: a caller below, in-band SNR,
@@ -312,7 +312,7 @@ def run(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--trials", type=int, default=500, help="per cell (default 500)")
+    parser.add_argument("--trials", type=int, default=200, help="per cell (default 200)")
     parser.add_argument("--processes", type=int, default=1, help="side by side (default 1)")
     parser.add_argument("--quick", action="store_true", help="10 trials of three cells")
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME", help="of the estimators, not all")

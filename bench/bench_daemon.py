@@ -445,7 +445,7 @@ def main() -> None:
     parser.add_argument(
         "--quick", action="store_true", help="seconds instead of minutes: a test that it runs"
     )
-    parser.add_argument("--frames", type=int, default=1_000_000, help="for growth (default 1,000,000)")
+    parser.add_argument("--frames", type=int, default=200_000, help="for growth (default 200,000)")
     parser.add_argument("--output", type=Path, default=report.default("daemon"))
     options = parser.parse_args()
     times = QUICK if options.quick else FULL

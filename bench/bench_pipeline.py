@@ -1,4 +1,4 @@
-"""The whole chain, frame to track: time of a hop for each estimator, where it goes, and memory.
+"""The whole chain, frame to track: time of a hop for each estimator, with the `mask` too, and memory.
 
     python bench/bench_pipeline.py [--quick] [--output FILE]
 
@@ -24,12 +24,16 @@ from locagen_edge.sim.scene import frames
 from locagen_edge.types import Frame
 
 ESTIMATORS = ("steered", "far-field", "two-mic", "model:tdoa-mlp", "hyperbolic")
+CHAINS = {
+    **{name: from_table({"bearing": {"estimator": name}}) for name in ESTIMATORS},
+    "steered, mask": from_table({"bearing": {"estimator": "steered"}, "denoise": {"kind": "mask"}}),
+}
 
 
 def measure(rounds: int) -> dict[str, Any]:
     """Seconds per hop of the kernel and of each chain, taken in turns on the same frames."""
     sound: list[Frame] = list(itertools.islice(frames(from_table({})), rounds))
-    chains = {name: Pipeline(from_table({"bearing": {"estimator": name}})) for name in ESTIMATORS}
+    chains = {name: Pipeline(settings) for name, settings in CHAINS.items()}
     correlate = chains["far-field"]._correlate
     times: dict[str, list[float]] = {name: [] for name in ("kernel", *chains)}
     for frame in sound:

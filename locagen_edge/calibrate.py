@@ -11,7 +11,7 @@ import csv
 import io
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -63,8 +63,9 @@ class Heard:
     """what was wrong in some frames"""
 
 
-def hear(path: Path, settings: Settings, margin: float) -> Heard:
-    """Delays and levels of a recording. `margin`: how much longer than the settings' the lags may be.
+def hear(paths: Sequence[Path], settings: Settings, margin: float) -> Heard:
+    """Delays and levels of a recording, or of several as if they were one. `margin`: how much longer than the
+    settings' the lags may be.
 
     Raises `SourceError` for a file that cannot be used, `CalibrationError` for channels that cannot.
     """
@@ -83,7 +84,7 @@ def hear(path: Path, settings: Settings, margin: float) -> Heard:
     troughs = []
     kept: list[tuple[float, Tdoa, F64]] = []
     frames = 0
-    for number, frame in enumerate(wav_frames(path, plain)):
+    for number, frame in enumerate(wav_frames(paths, plain)):
         if number % stride:
             continue
         frames += 1
@@ -95,12 +96,13 @@ def hear(path: Path, settings: Settings, margin: float) -> Heard:
         if not wrong and np.all(np.isfinite(tdoa.delay_s)):
             middle_s = (frame.start + audio.frame / 2) / audio.rate_hz
             kept.append((middle_s, tdoa, correlation.power.astype(np.float64)))
-    _refuse_faulty(path, faults, frames)
-    _refuse_inverted(path, np.array(troughs), wide)
+    what = str(paths[0]) if len(paths) == 1 else f"{len(paths)} files"
+    _refuse_faulty(what, faults, frames)
+    _refuse_inverted(what, np.array(troughs), wide)
     usable = [row for row in kept if _closes(row[1], wide, CLOSURE / audio.rate_hz)]
     if len(usable) < LEAST_FRAMES:
         raise CalibrationError(
-            f"{path}: {len(usable)} of {frames} frames hold a sound that all microphones hear; at least "
+            f"{what}: {len(usable)} of {frames} frames hold a sound that all microphones hear; at least "
             f"{LEAST_FRAMES} are needed: record a loud broad-band sound (noise, claps, speech) walked all "
             "the way round, for half a minute or more, motors off"
         )
@@ -131,13 +133,13 @@ def _trough(correlation: Correlation) -> F64:
     return np.where(np.maximum(low, high) > 0.3, (low > high).astype(np.float64), np.nan)
 
 
-def _refuse_faulty(path: Path, faults: Counter[str], frames: int) -> None:
+def _refuse_faulty(what: str, faults: Counter[str], frames: int) -> None:
     lasting = sorted(text for text, count in faults.items() if count > FAULTY * frames)
     if lasting:
-        raise CalibrationError("\n".join(f"{path}: {text}" for text in lasting))
+        raise CalibrationError("\n".join(f"{what}: {text}" for text in lasting))
 
 
-def _refuse_inverted(path: Path, troughs: F64, array: MicArray) -> None:
+def _refuse_inverted(what: str, troughs: F64, array: MicArray) -> None:
     clear = np.sum(np.isfinite(troughs), axis=0)
     share = np.nansum(troughs, axis=0) / np.maximum(clear, 1)
     against = {
@@ -154,7 +156,7 @@ def _refuse_inverted(path: Path, troughs: F64, array: MicArray) -> None:
     names = ", ".join(str(m) for m in sorted(inverted))
     doubt = " (or the other one)" if array.mics == 2 else ""
     raise CalibrationError(
-        f"{path}: microphone {names}{doubt}: inverted (its sound comes upside down): mend the wiring or the "
+        f"{what}: microphone {names}{doubt}: inverted (its sound comes upside down): mend the wiring or the "
         "channel's polarity, and record again"
     )
 
@@ -382,10 +384,12 @@ def calibrated(settings: Settings, heard: Heard, found: Calibration) -> Settings
     return replace(settings, array=array)
 
 
-def write_settings(path: Path, settings: Settings, recording: Path) -> None:
+def write_settings(path: Path, settings: Settings, recordings: Sequence[Path]) -> None:
     """The whole settings file with its manual, or what was there before. Raises `CalibrationError`."""
+    more = f" and {len(recordings) - 1} more" if len(recordings) > 1 else ""
     origin = (
-        f"[array] was measured by `locagen-edge calibrate` from {recording.name!r}; the rest is as it was."
+        f"[array] was measured by `locagen-edge calibrate` from {recordings[0].name!r}{more}; the rest is as "
+        "it was."
     )
     try:
         write(path, sample(settings, origin))

@@ -17,7 +17,7 @@ from locagen_edge.mavlink.parameters import kept
 from locagen_edge.mavlink.signing import Guard, guard_of
 from locagen_edge.models import directory_of, load_model, read_manifest
 from locagen_edge.pipeline import Pipeline
-from locagen_edge.settings import BearingSettings, Settings
+from locagen_edge.settings import BearingSettings, DenoiseSettings, Settings
 from locagen_edge.sources import open_source
 
 Finding = tuple[bool, str, str]
@@ -52,13 +52,21 @@ def check(settings: Settings, seconds: float) -> Iterator[Finding]:
             modes = ", ".join(settings.flight.modes)
             yield True, "flight", f"flight.{name} is ON: we may command the vehicle in mode {modes}"
     yield from _models(settings)
+    # the microphones can still be judged without what cannot be made
+    fit = replace(settings, denoise=DenoiseSettings())
     try:
-        pipeline = Pipeline(settings)
+        pipeline = Pipeline(fit)
         yield True, "estimator", settings.bearing.estimator
     except LocagenError as error:
         yield False, "estimator", str(error)
-        # the microphones can still be judged
-        pipeline = Pipeline(replace(settings, bearing=BearingSettings()))
+        fit = replace(fit, bearing=BearingSettings())
+        pipeline = Pipeline(fit)
+    if settings.denoise.kind != "none":
+        try:
+            pipeline = Pipeline(replace(fit, denoise=settings.denoise))
+            yield True, "denoiser", settings.denoise.kind
+        except LocagenError as error:
+            yield False, "denoiser", str(error)
     yield from asyncio.run(_listen(settings, pipeline, max(seconds, LEAST_S)))
     try:
         guard = guard_of(settings)
@@ -73,20 +81,26 @@ def check(settings: Settings, seconds: float) -> Iterator[Finding]:
 
 def _models(settings: Settings) -> Iterator[Finding]:
     """Every model of the manifest is loaded; one made for another array is fine as long as it is not used."""
+    used = _models_used(settings)
     try:
         names = sorted(read_manifest(directory_of(settings)))
     except LocagenError as error:
-        # without a manifest everything but the learned estimators works
-        yield not settings.bearing.estimator.startswith("model:"), "models", str(error)
+        # without a manifest everything works that is not learned
+        yield not used, "models", str(error)
         return
     for name in names:
-        used = settings.bearing.estimator == f"model:{name}"
         try:
             load_model(name, settings)
         except LocagenError as error:
-            yield not used, "models", f"{error}{'' if used else ' (not used)'}"
+            yield name not in used, "models", f"{error}{'' if name in used else ' (not used)'}"
         else:
             yield True, "models", f"{name}: hash and tensors as in the manifest"
+
+
+def _models_used(settings: Settings) -> set[str]:
+    kind, estimator = settings.denoise.kind, settings.bearing.estimator
+    used = {getattr(settings.denoise, kind)} if kind in ("wave", "mask") else set()
+    return used | ({estimator.removeprefix("model:")} if estimator.startswith("model:") else set())
 
 
 async def _listen(settings: Settings, pipeline: Pipeline, seconds: float) -> list[Finding]:

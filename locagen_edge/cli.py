@@ -19,6 +19,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
+from dataclasses import fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -52,17 +53,23 @@ EXPORT_S = 5.0
 """How often `run --export` writes what is new."""
 EXPORT = "write callers to a map file, their places or bearings: .geojson, .kml or .gpx says the format"
 SERVICE_STATE = Path("/var/lib/locagen-edge")
-TYPES = ("start", "stop", "bearing", "call", "sighting", "fault", "link", "source", "losses", "lost")
+TYPES = (
+    *("start", "stop", "bearing", "call", "sighting", "fault", "link", "source", "losses"),
+    *("listening", "parameters", "lost"),
+)
 
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `locagen-edge`."""
+    # started with them closed: what is opened next must not become them either
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     arguments = _parser().parse_args(argv)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(formatter(sys.stderr))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
-    if sys.stdout is None:  # started with it closed
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal without a degree sign is no reason to stop
     if arguments.command not in (_run, _record):  # these two run until they are stopped
@@ -179,7 +186,8 @@ def _parser() -> argparse.ArgumentParser:
     log = command(
         "log",
         _log,
-        "print the black box of `run`: calls, faults, links, losses, and on request every bearing",
+        "print the black box of `run`: calls, faults, links, losses, what was set in flight, and on request "
+        "every bearing",
         "A record that a loss of power has torn is passed over.",
     )
     log.add_argument(
@@ -236,10 +244,17 @@ def _parser() -> argparse.ArgumentParser:
         "Put the array level in the open, motors off, and walk once or more all the way round it, a few "
         "metres away, with a loud broad-band sound (noise from a speaker, claps, speech) at its height. "
         "Prints what was found with its 1-sigma; exit code 1, and nothing is written, where the recording "
-        "could not determine it. The angle table has the columns time_s (of the recording), azimuth_deg "
-        "(clockwise from ahead) and maybe elevation_deg; between two lines the sound goes the shorter way.",
+        "could not determine it. The angle table has the columns time_s (of the recordings as one), "
+        "azimuth_deg (clockwise from ahead) and maybe elevation_deg; between two lines the sound goes the "
+        "shorter way.",
     )
-    calibrate.add_argument("file", type=Path, metavar="FILE.wav", help="WAV or FLAC, any rate, as recorded")
+    calibrate.add_argument(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="FILE.wav",
+        help="WAV or FLAC, any rate, as recorded; several, or a folder of them, are one after another",
+    )
     calibrate.add_argument("--write", type=Path, metavar="PATH", help="write settings with what was found")
     calibrate.add_argument("--angles", type=Path, metavar="CSV", help="where the sound was; default: unknown")
     calibrate.add_argument(
@@ -309,6 +324,17 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     return load(DEFAULT_PATH) if DEFAULT_PATH.exists() else Settings()
 
 
+def _settings_in_service(arguments: argparse.Namespace) -> Settings:
+    """The settings; the service's, by hand too, with the state that the service keeps: what was set over
+    MAVLink holds, and is changed, where the service will find it."""
+    settings = _settings(arguments)
+    installed = arguments.settings in (None, DEFAULT_PATH) and DEFAULT_PATH.exists()
+    told = settings.mavlink.state_directory or os.environ.get("STATE_DIRECTORY")
+    if told or not installed or not SERVICE_STATE.is_dir():
+        return settings
+    return replace(settings, mavlink=replace(settings.mavlink, state_directory=str(SERVICE_STATE)))
+
+
 # --- run ----------------------------------------------------------------------------------------------
 
 
@@ -318,7 +344,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if notes:
         _put_off(Path(notes))
     one_arena()
-    settings = _settings(arguments)
+    settings = _settings_in_service(arguments)
     callers, recorder = _callers(arguments), None
     with contextlib.ExitStack() as ending:
         if callers is not None:
@@ -384,7 +410,13 @@ async def _serve(
             recorder.gap(0)  # each time it is opened it begins anew
         return open_source(settings, recorder)
 
-    daemon = Daemon(settings, on_second=each_second, on_estimate=each_estimate, sources=source)
+    daemon = Daemon(
+        settings,
+        on_second=each_second,
+        on_estimate=each_estimate,
+        on_settings=None if recorder is None else recorder.apply,
+        sources=source,
+    )
     stopping.calls(daemon.stop)
     if not quiet:
         links = ", ".join(settings.mavlink.link)
@@ -535,6 +567,8 @@ COLUMNS: dict[str, str] = {
     "faults": "",
 }
 """What one line of `replay` holds, and how the table prints it."""
+NOT_HEARD = {"mavlink", "flight", "daemon", "record", "log"}
+"""sections of the settings that are nothing to a replay"""
 
 
 def record(estimate: Estimate, t_s: float) -> dict[str, Any]:
@@ -588,11 +622,9 @@ def _caller_in_words(c: dict[str, Any]) -> str:
 def _replay(arguments: argparse.Namespace) -> int:
     files = _recordings(arguments.files)
     callers = _callers(arguments)
-    beside = files[0].with_suffix(".toml")
-    if arguments.settings is None and beside.is_file():
-        logging.info("settings: %s", beside)
-        arguments.settings = beside
-    settings = _settings(arguments)
+    settings = _settings_beside(files) if arguments.settings is None else None
+    if settings is None:
+        settings = _settings(arguments)
     if arguments.format == "table":
         print("  ".join(f"{name:>{_width(name)}}" for name in COLUMNS))
     for line in replay(files, settings, callers):
@@ -614,6 +646,31 @@ def _recordings(paths: list[Path]) -> list[Path]:
             raise SourceError(f"{path}: there is no WAV or FLAC in this folder")
         found += inside
     return found
+
+
+def _settings_beside(files: list[Path]) -> Settings | None:
+    """What all were recorded with; None where nothing tells. Raises `SourceError` where they differ."""
+    beside = [path for file in files if (path := file.with_suffix(".toml")).is_file()]
+    if not beside:
+        return None
+    settings: Settings = load(beside[0])
+    for path in beside[1:]:
+        if differ := list(_differ(settings, load(path))):
+            raise SourceError(
+                f"{path}: {', '.join(differ)} other than in {beside[0]}: replay them one by one, or give "
+                "--settings for all"
+            )
+    logging.info("settings: %s", beside[0])
+    return settings
+
+
+def _differ(a: Settings, b: Settings) -> Iterator[str]:
+    """Names of the settings that differ, of those that bearings depend on."""
+    for section in fields(Settings):
+        one, other = getattr(a, section.name), getattr(b, section.name)
+        for key in fields(one) if section.name not in NOT_HEARD else ():
+            if getattr(one, key.name) != getattr(other, key.name):
+                yield f"{section.name}.{key.name}"
 
 
 def replay(files: list[Path], settings: Settings, callers: Callers | None = None) -> Iterator[dict[str, Any]]:
@@ -755,9 +812,9 @@ def _log(arguments: argparse.Namespace) -> int:
         found: Iterable[Record] = chosen(records(directory), set(arguments.type), arguments.since)
         if arguments.last is not None:
             found = deque(found, arguments.last)
-        if arguments.format == "table":
-            print(HEADER)
-        for record in found:
+        for number, record in enumerate(found):
+            if arguments.format == "table" and number == 0:
+                print(HEADER)
             print(row(record) if arguments.format == "table" else json.dumps(record))
     except (FileNotFoundError, NotADirectoryError):
         raise StorageError(f"{directory}: there is no such folder; is log.directory set?") from None
@@ -823,7 +880,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from locagen_edge.check import check
 
     wrong = 0
-    for good, what, text in check(_settings(arguments), arguments.seconds):
+    for good, what, text in check(_settings_in_service(arguments), arguments.seconds):
         print(f"{'ok   ' if good else 'WRONG'}  {what}: {text}", flush=True)
         wrong += not good
     if wrong:
@@ -847,7 +904,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         angle_sigma_rad=math.radians(arguments.angle_sigma_deg),
     )
     table = None if arguments.angles is None else door.read_angles(arguments.angles)
-    heard = door.hear(arguments.file, settings, arguments.margin)
+    files = _recordings(arguments.files)
+    heard = door.hear(files, settings, arguments.margin)
     if table is not None:
         heard, walk = door.at_angles(heard, table, walk, arguments.angles)
     found = door.fitted(heard, settings, walk)
@@ -857,6 +915,6 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         written = ["nothing is written"] if arguments.write is not None else []
         raise CalibrationError("\n".join([*found.doubts, *written]))
     if arguments.write is not None:
-        door.write_settings(arguments.write, door.calibrated(settings, heard, found), arguments.file)
+        door.write_settings(arguments.write, door.calibrated(settings, heard, found), files)
         print(f"written     {arguments.write}")
     return 0

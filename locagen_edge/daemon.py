@@ -72,8 +72,8 @@ class Daemon:
     """One source, one pipeline, one component on all its links.
 
     `on_second(daemon)` is called once per second of the main loop, `on_estimate(frame, estimate)` for each
-    frame; neither may wait. `sources` opens the source that the
-    settings name; a test passes its own.
+    frame, `on_settings(settings)` with those that are flown: before the source is opened, and whenever others
+    are applied; none may wait. `sources` opens the source that the settings name; a test passes its own.
     """
 
     def __init__(
@@ -82,6 +82,7 @@ class Daemon:
         *,
         on_second: Callable[[Daemon], None] | None = None,
         on_estimate: Callable[[Frame, Estimate], None] | None = None,
+        on_settings: Callable[[Settings], None] | None = None,
         sources: Callable[[Settings], AsyncGenerator[Frame, None]] = open_source,
     ):
         self.settings = settings
@@ -92,6 +93,7 @@ class Daemon:
         self.black_box: BlackBox | None = None
         self._on_second = on_second
         self._on_estimate = on_estimate
+        self._on_settings = on_settings
         self._sources = sources
         self._stopping = asyncio.Event()
         self._queue: asyncio.Queue[Frame | None] = asyncio.Queue()
@@ -121,6 +123,8 @@ class Daemon:
         for text in (*told, *faults):
             log.warning("%s", text)
         self._applied = self.settings
+        if self._on_settings is not None:
+            self._on_settings(self.settings)
         self.component = Component(
             self.settings.mavlink,
             pose=self.settings.pose,
@@ -286,12 +290,15 @@ class Daemon:
             try:
                 await loop.run_in_executor(self._executor, self.pipeline.apply, wanted)
             except Exception as error:  # whatever it is, the old settings go on listening
-                expected = isinstance(error, LocagenError)
-                log.error("parameters are not applied: %s", error, exc_info=not expected)
+                log.error("parameters are not applied: %s", error, exc_info=_unexpected(error))
                 self.settings = self._applied
                 self.component.put_back(self._applied, f"Not applied: {error}")
             else:
                 self._applied = wanted
+                if self.black_box is not None:
+                    self.black_box.apply(wanted)
+                if self._on_settings is not None:
+                    self._on_settings(wanted)
                 log.info("settings by parameters: %s", self.component.parameters.changed or "none")
         self._applying = None
 
@@ -300,7 +307,13 @@ class Daemon:
 
     def _forget_noise(self) -> None:
         log.warning("the noise is learnt anew, as commanded over MAVLink")
-        self._executor.submit(self.pipeline.forget_noise)
+        forgetting = asyncio.get_running_loop().run_in_executor(self._executor, self.pipeline.forget_noise)
+        forgetting.add_done_callback(self._have_forgotten)
+
+    def _have_forgotten(self, done: asyncio.Future[None]) -> None:
+        if not done.cancelled() and (error := done.exception()):
+            log.error("the noise is not learnt anew: %s", error, exc_info=_unexpected(error))
+            self.component.tell_fault(f"Noise is not learnt anew: {error}")
 
     def _keep_parameters(self) -> None:
         """What was changed, on disk: a second later at most, and never on the loop that carries sound."""
@@ -414,8 +427,12 @@ class Daemon:
                 "frames": c.dropped,
                 "overruns": c.sound.overruns,
                 "messages": self.links.dropped,
+                "flooded_bytes": self.links.flooded_bytes,
+                "held_back": self.component.changes.held_back,
                 "sound_s": round(c.sound.lost_s, 1),
             },
+            "listening": {"on": self.component.listening},
+            "parameters": dict(self.component.parameters.changed),
         }
 
     def _tell_losses(self) -> None:
@@ -453,8 +470,17 @@ class Daemon:
         if not self.hearing:
             state = f"no sound: {self.source_fault or 'waiting'}"
         losses = f"{c.dropped} dropped, {c.sound}, {self.links.dropped} messages lost"
+        if self.links.flooded_bytes:
+            losses += f", {self.links.flooded_bytes} bytes of a flood not read"
+        if self.component.changes.held_back:
+            losses += f", {self.component.changes.held_back} commands or parameters held back"
         if self.black_box is not None and self.black_box.lost:
             losses += f", {self.black_box.lost} log records lost"
         faults = list(self.estimate.faults) if self.hearing and self.estimate is not None else []
         down = [f"link down: {self.links.last_error}"] if self.links.last_error else []
         return "; ".join([state, *faults, f"{c.estimates} frames, {losses}", *down, *self._complaints])
+
+
+def _unexpected(error: BaseException) -> BaseException | None:
+    """What the log has to tell the way of, not only in words."""
+    return None if isinstance(error, LocagenError) else error

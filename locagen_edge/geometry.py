@@ -131,16 +131,6 @@ def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
     return (w, x, y, z)
 
 
-def to_earth(q: Quaternion, azimuth_rad: float, elevation_rad: float) -> tuple[float, float]:
-    """Azimuth from true north and elevation over the horizon of a direction given in body axes."""
-    return angles(rotation(q) @ direction(azimuth_rad, elevation_rad))
-
-
-def to_body(q: Quaternion, azimuth_rad: float, elevation_rad: float) -> tuple[float, float]:
-    """Azimuth and elevation in body axes of a direction given from true north and over the horizon."""
-    return angles(rotation(q).T @ direction(azimuth_rad, elevation_rad))
-
-
 # --- the array ------------------------------------------------------------------------------------------
 
 
@@ -191,11 +181,6 @@ class MicArray:
         """Delays (pairs,) of a plane wave from direction u (3,)."""
         delays: F64 = self.baselines_m @ u / speed_m_s
         return delays
-
-    def arrivals_s(self, source_m: F64, speed_m_s: float) -> F64:
-        """Travel times (mics,) from a point source at (3,) metres."""
-        times: F64 = np.linalg.norm(self.positions_m - source_m, axis=1) / speed_m_s
-        return times
 
 
 def equilateral(side_m: float = 0.10) -> MicArray:

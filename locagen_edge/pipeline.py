@@ -81,9 +81,12 @@ class Pipeline:
         self._track.apply(settings.track, settings.pose, settings.mic_array.normal)
 
     def forget_noise(self) -> None:
-        """Learns background and noise from nothing: call it between two frames."""
-        self._locate.forget()
+        """Learns background and noise from nothing: call it between two frames.
+
+        Raises as the constructor does, and nothing is forgotten then.
+        """
         self._denoise, self._mask = _made_denoiser(self._settings)
+        self._locate.forget()
         self._detect.forget()
 
     def process(self, frame: Frame, pose: Pose | None = None) -> Estimate:

@@ -8,6 +8,7 @@ that one place, so they cannot disagree.
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import re
 import textwrap
@@ -324,8 +325,8 @@ class DetectionSettings:
     evidence: float = setting(
         5.0,
         "Estimator `steered`: how many times what noise alone scores a direction has to score to be a call. "
-        "5 gives no false call in half an hour of rotors that hover, nor in two hours of rotors that hunt; "
-        "4 hears further.",
+        "5 gives no false call in an hour of rotors that hover, nor in one of rotors that hunt; 4 hears "
+        "further.",
         unit="times", least=1, most=1000,
     )  # fmt: skip
     repeats_s: float = setting(
@@ -533,8 +534,8 @@ class MavlinkSettings:
     state_directory: str = setting(
         "",
         "Folder where what was set over MAVLink (parameters.toml) and signing's last timestamp are kept over "
-        "restarts; empty: the service's state directory, /var/lib/locagen-edge under systemd, else "
-        "~/.local/state/locagen-edge.",
+        "restarts; empty: the service's state directory, /var/lib/locagen-edge (for `run` and `check` by "
+        "hand too, with the installed settings), else ~/.local/state/locagen-edge.",
     )
     send_records: bool = setting(
         True, "LOCAGEN_BEARING and LOCAGEN_POSITION: the whole record at once, for programs that know them."
@@ -1002,7 +1003,7 @@ def _toml(value: Any) -> str:
         return "[\n" + "".join(f"    {_toml(row)},\n" for row in value) + "]"
     formats: dict[type, Callable[[Any], str]] = {
         bool: lambda v: "true" if v else "false",
-        str: lambda v: '"' + v + '"',
+        str: lambda v: json.dumps(v, ensure_ascii=False).replace("\x7f", "\\u007f"),  # JSON lets DEL stand
         tuple: lambda v: "[" + ", ".join(_toml(item) for item in v) + "]",
     }
     return formats.get(type(value), repr)(value)

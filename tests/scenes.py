@@ -10,7 +10,7 @@ import numpy as np
 import soundfile
 import soxr
 
-from locagen_edge.geometry import direction
+from locagen_edge.geometry import MicArray, direction
 from locagen_edge.settings import Settings
 from locagen_edge.sim.calls import CALLS
 from locagen_edge.sim.levels import band_power, from_db
@@ -31,6 +31,17 @@ def heard(
     noise = rng.standard_normal(clean.shape)
     noise *= math.sqrt(band_power(clean[0], rate_hz) / from_db(snr_db) / band_power(noise[0], rate_hz))
     return (clean + noise).astype(np.float32)
+
+
+def arrivals_s(array: MicArray, source_m: F64, speed_m_s: float) -> F64:
+    """Travel times (mics,) from a point source at (3,) metres."""
+    times: F64 = np.linalg.norm(array.positions_m - source_m, axis=1) / speed_m_s
+    return times
+
+
+def to_db(power: float) -> float:
+    """Level in dB of a power ratio above zero."""
+    return float(10.0 * np.log10(power))
 
 
 def cut(settings: Settings, samples: F32) -> list[Frame]:

@@ -17,9 +17,10 @@ from locagen_edge.daemon import Daemon
 from locagen_edge.errors import ModelError, SettingsError
 from locagen_edge.geometry import compass_deg
 from locagen_edge.mavlink.framer import Framer
-from locagen_edge.mavlink.parameters import kept, kept_file
+from locagen_edge.mavlink.parameters import keep, kept, kept_file
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings, from_table
+from locagen_edge.store.journal import records
 from locagen_edge.types import Frame
 
 STEERED = from_table({"bearing": {"estimator": "steered"}})
@@ -148,6 +149,22 @@ def test_forgotten_noise_is_learnt_anew() -> None:
     assert np.abs(pipeline._locate._search.noise()).max() > 0
 
 
+def test_noise_that_cannot_be_learnt_anew_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuses(_: Settings) -> None:
+        raise ModelError("model denoise-mask: the file is gone")
+
+    kept, untouched = Pipeline(STEERED), Pipeline(STEERED)
+    frames = cut(STEERED, noise(STEERED, 4.0))
+    for frame in frames:
+        kept.process(frame)
+        untouched.process(frame)
+    monkeypatch.setattr("locagen_edge.pipeline._made_denoiser", refuses)
+    with pytest.raises(ModelError):
+        kept.forget_noise()
+    assert np.array_equal(kept._locate._search.noise(), untouched._locate._search.noise())
+    assert kept._detect._minima == untouched._detect._minima
+
+
 # --- in the daemon ------------------------------------------------------------------------------------
 
 
@@ -223,6 +240,33 @@ def test_a_parameter_is_applied_live_and_holds_after_a_restart(operator, tmp_pat
     assert any(text.startswith("track.coast_s is 7.5, not 2") for text in found)
 
 
+def test_recording_and_log_tell_what_is_flown(operator, tmp_path) -> None:
+    """What was kept from the flight before, and what is set in this one."""
+    settings = settings_of(operator, tmp_path, log={"directory": str(tmp_path / "log")})
+    keep(kept_file(settings), {"LG_ARRAY_YAW": 30.0})
+    flown: list[Settings] = []
+
+    async def test() -> None:
+        arguments = {"sources": source(settings), "on_settings": flown.append}
+        async with running(settings, **arguments) as daemon:
+            assert [s.array.mount_deg[2] for s in flown] == [30.0]
+            await until(lambda: operator.of("HEARTBEAT") and daemon.estimate)
+            operator.set("LG_TRK_COAST", 7.5)
+            operator.command(common.MAV_CMD_USER_1, 0.0)
+            await until(lambda: len(flown) == 2)
+            assert daemon.black_box._settings is flown[1]
+            states = daemon._states()
+            assert states["parameters"] == {"LG_ARRAY_YAW": 30.0, "LG_TRK_COAST": 7.5}
+            await until(lambda: not daemon.component.listening)
+            assert daemon._states()["listening"] == {"on": False}
+
+    asyncio.run(test())
+    assert flown[1].track.coast_s == 7.5
+    assert flown[1].array.mount_deg[2] == 30.0
+    start = next(records(tmp_path / "log"))
+    assert start["settings"]["array"]["mount_deg"] == [0.0, 0.0, 30.0]
+
+
 def test_setting_it_back_leaves_nothing_behind(operator, tmp_path) -> None:
     settings = settings_of(operator, tmp_path)
 
@@ -256,6 +300,28 @@ def test_what_the_pipeline_cannot_do_is_put_back_and_told(operator, tmp_path, mo
         assert not kept_file(settings).exists()
 
     asyncio.run(test())
+
+
+@pytest.mark.parametrize("error", [ModelError("model x: it is gone"), MemoryError("no room")])
+def test_noise_that_is_not_learnt_anew_is_told(operator, tmp_path, monkeypatch, caplog, error) -> None:
+    settings = settings_of(operator, tmp_path)
+
+    def refuses() -> None:
+        raise error
+
+    async def test() -> None:
+        async with running(settings, sources=source(settings)) as daemon:
+            await until(lambda: operator.of("HEARTBEAT") and daemon.estimate)
+            monkeypatch.setattr(daemon.pipeline, "forget_noise", refuses)
+            operator.command(common.MAV_CMD_USER_2)
+            told = f"Noise is not learnt anew: {error}"
+            await until(lambda: any(m.text == told for m in operator.of("STATUSTEXT")))
+            estimates = daemon.counters.estimates
+            await until(lambda: daemon.counters.estimates > estimates + 3)
+
+    asyncio.run(test())
+    (line,) = [r for r in caplog.records if "not learnt anew" in r.getMessage()]
+    assert bool(line.exc_info) == isinstance(error, MemoryError), "what nobody expected, with its way"
 
 
 def test_a_folder_that_cannot_be_written_is_told(operator, tmp_path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import arrivals_s
 
 from locagen_edge.geometry import MicArray, direction, equilateral
 from locagen_edge.sim.arrivals import BLOCK, Arrivals, TwinSettings, draw
@@ -35,7 +36,7 @@ def test_true_delays_are_those_of_the_geometry_in_double_precision() -> None:
     found = sample(EXACT)
     wanted = np.empty((3, 1000))
     for k, (x, y) in enumerate(found.position_m.T.astype(np.float64)):
-        times = ARRAY.arrivals_s(np.array([x, y, 0.0]), SPEED)
+        times = arrivals_s(ARRAY, np.array([x, y, 0.0]), SPEED)
         wanted[:, k] = [times[j] - times[i] for i, j in ARRAY.pairs]
     # single precision of path differences: 10 nm, 30 ps; a thousandth of a sample would be 1e-7 s
     np.testing.assert_allclose(found.true_delay_s, wanted, atol=2e-10)
@@ -167,7 +168,7 @@ def test_arrays_of_other_shapes_work() -> None:
     assert found.delay_s.shape == (6, 100)
     middle = square.positions_m.mean(axis=0)
     x, y = found.position_m[:, 5].astype(np.float64)
-    times = square.arrivals_s(middle + np.array([x, y, 20.0]), SPEED)
+    times = arrivals_s(square, middle + np.array([x, y, 20.0]), SPEED)
     np.testing.assert_allclose(found.delay_s[:3, 5], times[1:] - times[0], atol=1e-9)
 
 

@@ -11,6 +11,7 @@ import pytest
 from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import arrivals_s
 
 from locagen_edge.geometry import angles, direction, wrap
 from locagen_edge.settings import Settings, from_table
@@ -45,7 +46,7 @@ def plane_wave(settings: Settings, azimuth: float, elevation: float = 0.0) -> Td
 
 
 def point(settings: Settings, source_m: np.ndarray, sigma_s: float = SIGMA_S) -> Tdoa:
-    arrival = settings.mic_array.arrivals_s(np.asarray(source_m), settings.speed_m_s)
+    arrival = arrivals_s(settings.mic_array, np.asarray(source_m), settings.speed_m_s)
     return tdoa(np.array([arrival[j] - arrival[i] for i, j in settings.mic_array.pairs]), sigma_s)
 
 

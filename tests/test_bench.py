@@ -43,7 +43,7 @@ def test_kernel(tmp_path):
 def test_pipeline(tmp_path):
     report = run("bench_pipeline.py", tmp_path)
     times = report["seconds_per_hop"]
-    assert {"kernel", "far-field", "hyperbolic"} <= times.keys()
+    assert {"kernel", "steered", "far-field", "hyperbolic", "steered, mask"} <= times.keys()
     for values in times.values():
         assert 0 < values["min"] <= values["median"] <= values["p99"] <= values["max"]
     assert report["peak_rss_mib"] > 10

@@ -152,6 +152,34 @@ def test_calibrating_what_is_calibrated_changes_nothing(walk, tmp_path, capsys):
     assert before == pytest.approx(after, rel=0.05)
 
 
+def test_a_walk_in_several_files_is_one(walk, angles, tmp_path, capsys):
+    """Also by their folder; what lies across a seam is left out, and little changes."""
+    folder, one, two = tmp_path / "walk", tmp_path / "one.toml", tmp_path / "two.toml"
+    folder.mkdir()
+    sound, rate = soundfile.read(walk, dtype="float32")
+    for name, part in (("1.wav", sound[: 20 * rate]), ("2.wav", sound[20 * rate :])):
+        soundfile.write(folder / name, part, rate, subtype="PCM_24")
+    for files in ([folder / "1.wav", folder / "2.wav"], [folder]):
+        call(capsys, walk, "--angles", angles, "--write", one)
+        code, _, _ = call(capsys, *files, "--angles", angles, "--write", two)
+        assert code == 0
+        whole, parts = load(one).array, load(two).array
+        assert np.abs(np.array(whole.positions_m) - np.array(parts.positions_m)).max() < 2e-5
+        assert parts.delays_s == pytest.approx(whole.delays_s, abs=1e-7)
+        assert "from '1.wav' and 1 more; the rest" in " ".join(two.read_text()[:400].split("\n# "))
+
+
+def test_a_second_walk_counts_beside_the_first(walk, tmp_path, capsys):
+    again = tmp_path / "again.wav"
+    record(again, seed=2)
+    usable = []
+    for walks in ([walk], [walk, again]):
+        code, out, _ = call(capsys, *walks)
+        assert code == 0, out
+        usable.append(int(out.partition("usable ")[2].partition(",")[0]))
+    assert usable[1] > 1.9 * usable[0]
+
+
 @pytest.mark.parametrize("estimator", ["far-field", "steered"])
 def test_bearings_of_another_scene_become_as_good_as_the_tolerance(walk, angles, tmp_path, capsys, estimator):
     """2 mm and 10 us are some 3 degrees; what is left is the angles' own degree over their number, and the

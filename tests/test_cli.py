@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import pty
+import shutil
 import socket
 import struct
 import subprocess
@@ -137,6 +138,21 @@ def test_replay_obeys_the_settings(recording, tmp_path):
     assert np.median([line["azimuth_deg"] for line in lines]) == pytest.approx(57.0 - 120.0 + 360.0, abs=3.0)
 
 
+def test_recordings_of_other_settings_are_not_replayed_as_one(recording, tmp_path):
+    """A session of another yaw would be told by the first one's; links are nothing to a replay."""
+    for name, text in (("a", ""), ("b", "# another day\n[mavlink]\nrate_hz = 7\n"), ("c", "")):
+        (tmp_path / f"{name}.wav").write_bytes(recording.read_bytes())
+        (tmp_path / f"{name}.toml").write_text(f"{text}[bearing]\nestimator = 'far-field'\n")
+    done = cli("replay", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["estimator"] == "far-field"
+    (tmp_path / "c.toml").write_text("[bearing]\nestimator = 'far-field'\n[array]\nmount_deg = [0, 0, 90]\n")
+    says = f"{tmp_path}/c.toml: array.mount_deg other than in {tmp_path}/a.toml: replay them one by one"
+    fails(1, says, "replay", tmp_path)
+    done = cli("replay", tmp_path, "--settings", tmp_path / "c.toml")
+    assert done.returncode == 0, done.stderr
+
+
 def test_replay_ends_quietly_when_its_reader_does(recording):
     command = f"{sys.executable} -m locagen_edge replay {recording} | head -1"
     done = subprocess.run(
@@ -233,6 +249,12 @@ def test_a_full_disk_is_one_line(recording, arguments):
 
 def test_closed_output_and_poor_terminals_are_borne(recording):
     assert shell(f"locagen-edge replay {recording} >&-").returncode == 0
+    done = shell(f"locagen-edge replay {recording} 2>&-")
+    assert done.returncode == 0
+    assert len(done.stdout.splitlines()) > 30
+    assert shell(f"locagen-edge replay {recording} >&- 2>&-").returncode == 0
+    assert shell("locagen-edge replay nowhere.wav 2>&-").returncode == 1
+    assert shell("locagen-edge replay 2>&-").returncode == 2
     done = shell("PYTHONIOENCODING=ascii locagen-edge run --seconds 1.5")
     assert done.returncode == 0, done.stderr
     assert "bearing" in done.stdout
@@ -312,6 +334,29 @@ def test_check_goes_on_after_an_unfit_model(tmp_path):
     assert "link" in done.stdout
 
 
+@pytest.mark.parametrize("kind", ["mask", "wave"])
+def test_check_goes_on_without_a_denoiser_and_says_which_models_are_used(kind, tmp_path):
+    models = tmp_path / "models"
+    shutil.copytree(ROOT / "models", models)
+    (models / f"denoise-{kind}.onnx").write_bytes(b"torn")
+    (models / "tdoa-mlp.onnx").write_bytes(b"torn")
+    settings = tmp_path / "s.toml"
+    settings.write_text(f'[denoise]\nkind = "{kind}"\n[models]\ndirectory = "{models}"\n')
+    done = cli("check", "--seconds", "0.5", "--settings", settings)
+    assert done.returncode == 1
+    models_told = [line for line in done.stdout.splitlines() if "  models: " in line]
+    wrong = [line for line in models_told if line.startswith("WRONG")]
+    unused = [line for line in models_told if line.endswith("(not used)")]
+    assert len(wrong) == 1, done.stdout
+    assert f"denoise-{kind}" in wrong[0]
+    assert len(unused) == 1, done.stdout
+    assert "tdoa-mlp" in unused[0]
+    assert "ok     estimator: steered" in done.stdout
+    assert f"WRONG  denoiser: model denoise-{kind}" in done.stdout
+    assert "ok     microphones" in done.stdout
+    assert "link: " in done.stdout
+
+
 def test_check_knows_a_link_that_never_opened(tmp_path):
     """A listener whose queue is full answers nothing."""
     with socket.socket() as listener, contextlib.ExitStack() as stack:
@@ -326,6 +371,40 @@ def test_check_knows_a_link_that_never_opened(tmp_path):
         settings.write_text(f'[mavlink]\nlink = "tcp:127.0.0.1:{listener.getsockname()[1]}"\n')
         done = cli("check", "--seconds", "1", "--settings", settings)
     assert "WRONG  link: " in done.stdout, done.stdout
+
+
+# --- the state of the service
+
+
+@pytest.mark.parametrize("given", [None, "settings", "others"])
+def test_by_hand_with_the_settings_of_the_service_what_it_was_told_over_mavlink_holds(tmp_path, given):
+    """The same flight as the service's, recorded by hand; other settings have nothing to do with it."""
+    installed, others, state = tmp_path / "settings", tmp_path / "others", tmp_path / "state"
+    for path in (installed, others):
+        path.write_text('[mavlink]\nlink = "udpout:127.0.0.1:9"\n')
+    state.mkdir()
+    (state / "parameters.toml").write_text("LG_TRK_COAST = 7.5\n")
+    at_hand = f"""
+import pathlib, sys
+from locagen_edge import cli
+cli.DEFAULT_PATH, cli.SERVICE_STATE = pathlib.Path({str(installed)!r}), pathlib.Path({str(state)!r})
+cli.main(sys.argv[1:])
+"""
+    said = []
+    for command in ("check", "run"):
+        settings = [] if given is None else ["--settings", tmp_path / given]
+        done = subprocess.run(
+            [sys.executable, "-c", at_hand, command, "--seconds", "0.5", *settings],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_STATE_HOME": str(tmp_path / "home")},
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        said.append(done.stdout + done.stderr)
+    holds = f"track.coast_s is 7.5, not 2: LG_TRK_COAST in {state}/parameters.toml"
+    assert [holds in text for text in said] == [given != "others"] * 2
 
 
 # --- devices

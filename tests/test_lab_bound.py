@@ -15,8 +15,8 @@ from locagen_edge.lab.bound import (
     best_table,
     cells,
     circular_median,
-    cramer_rao_deg,
     errors_rad,
+    expected_deg,
     look_up,
     mae_deg,
 )
@@ -25,6 +25,7 @@ from locagen_edge.lab.triangulation import least_squares
 from locagen_edge.lab.twin import at_rate, sample, with_spacing
 
 BAND = (300.0, 4000.0)
+SPEED = 343.0
 
 
 @settings(max_examples=50, deadline=None)
@@ -75,22 +76,27 @@ def test_half_the_spacing_is_half_the_rate() -> None:
     assert found[0] / found[1] == pytest.approx(4.0, rel=0.05)  # a quarter of the delays in samples
 
 
+def cramer_rao_deg(
+    snr_db: float = 10.0, seconds: float = 0.1, side: float = 0.1, azimuth: float = 0.0
+) -> float:
+    """The smallest mean |azimuth error| of a triangle for a far source on the horizon."""
+    sigma = arrival_sigma_s(snr_db, BAND, seconds, 3)
+    return float(expected_deg(equilateral(side), SPEED, np.array([azimuth]), np.zeros(1), sigma)[0])
+
+
 def test_cramer_rao_bound_of_the_triangle() -> None:
-    array, speed = equilateral(), 343.0
-    bound = cramer_rao_deg(array, speed, 10.0, BAND, 0.1)
+    bound = cramer_rao_deg()
     # J with sum (tau' - mean)^2 = d^2 / (2 c^2), written out
     sigma = arrival_sigma_s(10.0, BAND, 0.1, 3)
-    information = 0.1**2 / (2 * speed**2) / sigma**2
+    information = 0.1**2 / (2 * SPEED**2) / sigma**2
     assert bound == pytest.approx(math.degrees(math.sqrt(2 / (math.pi * information))), rel=1e-9)
     assert bound == pytest.approx(0.15, rel=0.2)  # the design's figure, whose SNR is over 0-5 kHz
-    turned = cramer_rao_deg(array, speed, 10.0, BAND, 0.1, azimuth_rad=1.0)
+    turned = cramer_rao_deg(azimuth=1.0)
     assert turned == pytest.approx(bound, rel=1e-9)  # an equilateral triangle has no preferred side
 
 
 def test_bound_shrinks_with_time_snr_and_size() -> None:
-    def of(snr_db: float = 10.0, seconds: float = 0.1, side: float = 0.1) -> float:
-        return cramer_rao_deg(equilateral(side), 343.0, snr_db, BAND, seconds)
-
+    of = cramer_rao_deg
     assert of(seconds=0.4) == pytest.approx(of() / 2, rel=0.02)
     assert of(side=0.2) == pytest.approx(of() / 2, rel=1e-9)
     assert of(snr_db=40) / of(snr_db=60) == pytest.approx(10.0, rel=1e-3)

@@ -10,6 +10,7 @@ import soundfile
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import to_db
 
 from locagen_edge.errors import DatasetError, ModelError
 from locagen_edge.geometry import direction
@@ -24,7 +25,7 @@ from locagen_edge.lab.nets.mask import BINS, LOOKAHEAD, MaskNet
 from locagen_edge.lab.nets.wave import STRIDE, WaveNet
 from locagen_edge.lab.settings import LabSettings, read
 from locagen_edge.models import default_directory, load_network
-from locagen_edge.sim.levels import band_power, to_db
+from locagen_edge.sim.levels import band_power
 from locagen_edge.sim.rotors import rotor
 from locagen_edge.stages.denoise import RATE_HZ
 

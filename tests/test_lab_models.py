@@ -83,12 +83,12 @@ def test_bins_lose_half_a_bin_and_their_mean_direction_gets_it_back_at_10_khz() 
 
 
 def test_readings_of_known_probabilities() -> None:
-    forest = Forest(LabSettings().forest, 4)
-    forest._model = type("Fitted", (), {"classes_": np.arange(4)})()
     probability = np.array([[0.0, 1.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.5]])  # bins of 90 degrees from 0
 
     def degrees(reading: str) -> np.ndarray:
-        y = forest.read_as(reading)._read(probability)
+        forest = Forest(LabSettings().forest, 4, reading)
+        forest._model = type("Fitted", (), {"classes_": np.arange(4)})()
+        y = forest._read(probability)
         return np.degrees(np.arctan2(y[:, 1], y[:, 0]))
 
     assert degrees("centre")[0] == pytest.approx(135.0)

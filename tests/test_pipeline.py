@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import soundfile
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 from scenes import (
@@ -24,7 +24,7 @@ from scenes import (
 
 from locagen_edge.cli import replay
 from locagen_edge.errors import SettingsError, SourceError
-from locagen_edge.geometry import direction, quaternion, to_body, wrap
+from locagen_edge.geometry import angles, direction, quaternion, rotation, wrap
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings, from_table
 from locagen_edge.sim.calls import CALLS
@@ -349,7 +349,7 @@ def test_a_caller_stands_still_in_the_earths_axes_under_a_drone_that_turns(rate_
     for number in range(80):
         t_ns = 4_000_000_000 + number * 51_200_000
         attitude = quaternion(0.1, 0.05, math.radians(rate_deg_s) * number * settings.hop_s)
-        here = to_body(attitude, *caller)
+        here = angles(rotation(attitude).T @ direction(*caller))
         frame = Frame(heard(settings, *here, 20.0, 1024, seed=number), 10_000.0, t_ns, number * 512)
         estimate = pipeline.process(frame, Pose(t_ns + 51_200_000, attitude))
         assert estimate.pose.attitude == attitude
@@ -408,6 +408,23 @@ def test_any_noise_at_any_level_gives_finite_answers(seed, level):
     x = (level * np.random.default_rng(seed).standard_normal((3, 2048))).astype(np.float32)
     for estimate in process(settings, x):
         finite(estimate)
+
+
+@examples(max_examples=30)
+@given(st.floats(-3, 15), st.floats(0, 60))
+@example(6.0, 8.0)
+def test_one_frame_of_any_level_and_any_gap_after_it_make_no_call_of_noise(level, gap_s):
+    settings = from_table({"bearing": {"estimator": "far-field"}})
+    pipeline, rng = Pipeline(settings), np.random.default_rng(0)
+    quiet = 1e-3 * rng.standard_normal((3, 20_480))
+    frames = cut(settings, quiet.astype(np.float32))
+    frames[0] = replace(frames[0], samples=frames[0].samples * np.float32(10.0**level))
+    before = round(gap_s * 1e9)
+    for frame in frames[:1] + [replace(f, t_ns=f.t_ns + before) for f in frames[1:]]:
+        estimate = pipeline.process(frame)
+        finite(estimate)
+    assert estimate.detection.level_dbfs == pytest.approx(-60.0, abs=1.0)
+    assert estimate.detection.snr_db < 3.0
 
 
 def test_silence_is_no_call_and_has_no_bearing():

@@ -23,6 +23,7 @@ from test_recorder import assert_same, settings_file, sounds, start
 from locagen_edge.geometry import quaternion
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.framer import Framer
+from locagen_edge.mavlink.parameters import keep, kept_file
 from locagen_edge.pipeline import Pipeline
 from locagen_edge.settings import Settings, load
 from locagen_edge.sim.scene import frames as sim_frames
@@ -57,7 +58,9 @@ def test_record_then_replay_of_the_folder(tmp_path, settings_file):
 def test_run_keeps_the_sound_that_its_bearings_came_from(tmp_path, settings_file):
     folder = tmp_path / "parts"
     more = f'[log]\ndirectory = "{tmp_path}/log"\n[bearing]\nestimator = "far-field"\n'
+    more += f'[mavlink]\nstate_directory = "{tmp_path}"\n'
     settings_file.write_text(settings_file.read_text() + more)
+    keep(kept_file(load(settings_file)), {"LG_ARRAY_YAW": 30.0})
     done = subprocess.run(
         [
             *(sys.executable, "-m", "locagen_edge", "run", "--quiet", "--seconds", "2.5"),
@@ -71,7 +74,8 @@ def test_run_keeps_the_sound_that_its_bearings_came_from(tmp_path, settings_file
     )
     assert done.returncode == 0, done.stderr
     live = [r for r in records(tmp_path / "log") if r["type"] == "bearing"]
-    settings = load(settings_file)
+    settings = load(sounds(folder)[0].with_suffix(".toml"))
+    assert settings.array.mount_deg[2] == 30.0, "as it was set over MAVLink"
     pipeline = Pipeline(settings)
     again = {f.start: plain(pipeline.process(f)) for f in wav_frames(sounds(folder), settings)}
     assert len(live) > 20

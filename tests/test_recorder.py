@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 
@@ -343,6 +343,22 @@ def test_the_folder_never_holds_more_than_it_may(tmp_path_factory, blocks, part_
 def test_too_little_room_from_the_start_is_told(tmp_path):
     with pytest.raises(StorageError, match=r"MB are free on the disk, record\.free_mb = 1e\+08 MB"):
         Recorder(tmp_path, make({"free_mb": 1e8}))
+
+
+def test_other_settings_begin_a_part_and_the_sound_goes_on(tmp_path):
+    settings = make()
+    turned = replace(settings, array=replace(settings.array, mount_deg=(0.0, 0.0, 90.0)))
+    recorder = Recorder(tmp_path, settings)
+    recorder.apply(replace(settings))  # equal: nothing begins
+    live = []
+    for number, frame in enumerate(islice(sim_frames(settings, recorder), 60)):
+        if number in (20, 40):
+            recorder.apply(turned if number == 20 else settings)
+        live.append(frame)
+    recorder.close()
+    beside = [load(path.with_suffix(".toml")) for path in sounds(tmp_path)]
+    assert beside == [settings, turned, settings]
+    assert_same(live, list(wav_frames(sounds(tmp_path), settings)))
 
 
 def test_levels_and_length_are_shown(tmp_path):

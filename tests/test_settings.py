@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tomllib
 
 import pytest
 from conftest import ROOT
-from hypothesis import given
+from hypothesis import example, given, reject
 from hypothesis import strategies as st
 
 from locagen_edge.errors import SettingsError
@@ -35,6 +36,30 @@ def test_every_key_of_the_sample_is_explained():
 def test_the_sample_of_changed_settings_reads_back_as_those():
     changed = from_table({"audio": {"hop": 256, "loop": True}, "array": {"tolerance_m": 0}})
     assert from_table(tomllib.loads(sample(changed))) == changed
+
+
+FREE = [
+    (section.name, key.name)
+    for section in dataclasses.fields(Settings)
+    for key in dataclasses.fields(section.default)
+    if type(key.default) is str and not (key.metadata["pattern"] or key.metadata["choices"])
+]
+
+
+@given(
+    st.dictionaries(st.sampled_from(FREE), st.text()),
+    st.lists(st.from_regex(r"udpout:[^:\s]+:14550", fullmatch=True), min_size=1, max_size=8, unique=True),
+)
+@example({("audio", "device"): 'Mic "A" \\ b\r\n\x7f\x85\u2028'}, ['udpout:a"\\:14550'])
+def test_the_sample_of_any_text_reads_back_as_it(texts, links):
+    table: dict = {"mavlink": {"link": links}}
+    for (section, key), text in texts.items():
+        table.setdefault(section, {})[key] = text
+    try:
+        settings = from_table(table)
+    except SettingsError:
+        reject()
+    assert from_table(tomllib.loads(sample(settings))) == settings
 
 
 TRIANGLE = [[0.05, 0, 0], [-0.03, 0.05, 0], [-0.03, -0.05, 0]]

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locagen_edge.geometry import angles, direction, quaternion, rotation, to_earth, wrap
+from locagen_edge.geometry import angles, direction, quaternion, rotation, wrap
 from locagen_edge.settings import PoseSettings, TrackSettings
 from locagen_edge.stages.track import Tracker
 from locagen_edge.stages.track.tracker import SWELL_S
@@ -325,7 +325,7 @@ def test_a_look_is_the_frames_own_bearing_in_the_earths_axes():
         attitude = turning(frame, 0.0)
         bearing = seen(200.0, -30.0, attitude, rng)
         track, *_ = t((bearing,), CALL, HOP_S, attitude)
-        wanted = to_earth(attitude, bearing.azimuth_rad, bearing.elevation_rad)
+        wanted = angles(rotation(attitude) @ direction(bearing.azimuth_rad, bearing.elevation_rad))
         assert (track.look.azimuth_rad, track.look.elevation_rad) == pytest.approx(wanted)
     sigmas = math.degrees(track.look.azimuth_sigma_rad), math.degrees(track.look.elevation_sigma_rad)
     noise = math.sqrt(2.0**2 - 0.5**2)

@@ -10,6 +10,7 @@ import pytest
 import soundfile
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import arrivals_s, to_db
 
 from locagen_edge.errors import DatasetError, SettingsError
 from locagen_edge.geometry import MicArray, equilateral, speed_of_sound
@@ -21,7 +22,7 @@ from locagen_edge.sim.arrivals import TwinSettings
 from locagen_edge.sim.calls import CALLS
 from locagen_edge.sim.converter import convert, drifted
 from locagen_edge.sim.ground import image_m
-from locagen_edge.sim.levels import band_power, to_db
+from locagen_edge.sim.levels import band_power
 from locagen_edge.sim.waveforms import BLOCK_SAMPLES, SOUNDS, SceneSettings, draw, fast_size, turns
 from locagen_edge.sim.wind import coherence, power, wind
 
@@ -81,7 +82,7 @@ def test_delays_are_exact(kind):
 def test_the_truth_is_the_geometry():
     drawn = make(count=50, n=256, twin={"range_m": 5.0, "position_error_m": 0.0, "height_m": 3.0})
     for k in range(50):
-        arrival = ARRAY.arrivals_s(drawn.position_m[k].astype(float), SPEED)
+        arrival = arrivals_s(ARRAY, drawn.position_m[k].astype(float), SPEED)
         assert drawn.true_delay_s[k] == pytest.approx([arrival[j] - arrival[i] for i, j in PAIRS], abs=1e-9)
         x, y, z = drawn.position_m[k]
         assert drawn.azimuth_rad[k] == pytest.approx(math.atan2(y, x), abs=1e-6)

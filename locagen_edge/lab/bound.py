@@ -102,22 +102,6 @@ def arrival_sigma_s(snr_db: float, band_hz: tuple[float, ...], seconds: float, m
     return float(1.0 / math.sqrt(gain * ((2.0 * math.pi * frequency) ** 2).sum()))
 
 
-def cramer_rao_deg(
-    array: MicArray,
-    speed_m_s: float,
-    snr_db: float,
-    band_hz: tuple[float, ...],
-    seconds: float,
-    azimuth_rad: float = 0.0,
-) -> float:
-    """The smallest mean |azimuth error| in degrees of a far source on the horizon, by Cramer and Rao.
-
-    With the sigma of `arrival_sigma_s`; see `expected_deg`.
-    """
-    sigma = arrival_sigma_s(snr_db, band_hz, seconds, array.mics)
-    return float(expected_deg(array, speed_m_s, np.array([azimuth_rad]), np.zeros(1), sigma)[0])
-
-
 def expected_deg(
     array: MicArray, speed_m_s: float, azimuth_rad: F64, elevation_rad: F64, sigma_s: float | F64
 ) -> F64:

@@ -65,12 +65,6 @@ class Forest:
         azimuth: F64 = np.arctan2(y[:, 1], y[:, 0])
         return azimuth
 
-    def read_as(self, reading: str) -> Forest:
-        """The same trees with another way to read an angle."""
-        other = Forest(self._settings, self.bins, reading)
-        other._model = self._model
-        return other
-
     def _bin(self, azimuth_rad: F32) -> np.ndarray:
         turns = (azimuth_rad.astype(np.float64) - self._first) / (2.0 * np.pi) % 1.0
         bins: np.ndarray = np.minimum((turns * self.bins).astype(np.int64), self.bins - 1)

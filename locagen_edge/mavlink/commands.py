@@ -14,6 +14,7 @@ Protocol: mavlink.io/en/services/command.html.
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -29,7 +30,6 @@ FASTEST_US = 50_000
 """20 a second, as `mavlink.rate_hz` allows"""
 
 ACCEPTED: int = messages.MAV_RESULT_ACCEPTED
-REJECTED: int = messages.MAV_RESULT_TEMPORARILY_REJECTED
 DENIED: int = messages.MAV_RESULT_DENIED
 UNSUPPORTED: int = messages.MAV_RESULT_UNSUPPORTED
 
@@ -182,7 +182,8 @@ class Commands:
         if known.reads:
             result, asked = known.do(self._desk, given, link)
             return [] if to_all and result != ACCEPTED else [_ack(message.command, result, sender), *asked]
-        this = (message.command, *given, *([link] if known.of_link else []))
+        # packed: an unused parameter is often NaN, which equals no other
+        this = (message.command, struct.pack("<4f", *given), link if known.of_link else None)
         what, when_s, result = self._done.get(sender, ((), -math.inf, 0))
         if what != this or now_s - when_s > RESEND_S:
             if not self._desk.may_change(now_s):

@@ -11,6 +11,7 @@ pymavlink's own `mavutil` would be shorter; it blocks, and it takes 186 ms and 3
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import logging
 import math
@@ -24,6 +25,7 @@ from types import MappingProxyType
 from typing import Any
 
 from locagen_edge.errors import LinkError
+from locagen_edge.mavlink.resolver import Resolver
 
 OPEN_S = 2.0
 """longest an attempt to open may take: TCP alone would try for two minutes, ever more seldom"""
@@ -91,17 +93,13 @@ class Link:
         self.spec = spec
         self._backoff_s = backoff_s
         self._on_bytes = on_bytes
+        self.addresses = Resolver(spec.target).addresses
         self._port: _Port | None = None
         self._told_up: bool | None = None
-        self._opened = 0
-        self.sent = 0
-        """frames handed to the system"""
-        self.sent_bytes = 0
         self.dropped = 0
         """frames that did not go: link down, nobody to send to, or too much waiting"""
-        self.received_bytes = 0
         self.flooded_bytes = 0
-        """of them dropped unread, because too much came"""
+        """bytes dropped unread, because too much came"""
         self._allowance = float(BURST)
         self._taken_s = -math.inf
         self.refused = 0
@@ -113,23 +111,15 @@ class Link:
         """Whether a frame sent now has somewhere to go."""
         return self._port is not None and self._port.ready
 
-    @property
-    def reopened(self) -> int:
-        """Times that the link was opened after the first."""
-        return max(0, self._opened - 1)
-
     def send(self, frame: bytes) -> bool:
         """Sends one frame, or drops and counts it. Never waits. True: it is on its way."""
         if self._port is None or not self._port.write(frame):
             self.dropped += 1
             return False
-        self.sent += 1
-        self.sent_bytes += len(frame)
         return True
 
     def take(self, data: bytes) -> None:
         """For the port: bytes have come."""
-        self.received_bytes += len(data)
         now_s = time.monotonic()
         self._allowance = min(self._allowance + (now_s - self._taken_s) * BYTES_PER_S, BURST)
         self._taken_s = now_s
@@ -158,7 +148,6 @@ class Link:
         except (OSError, ValueError) as error:  # ValueError: a baud rate or host name that cannot be
             self._tell_down(error)
             return False
-        self._opened += 1
         try:
             await asyncio.wait({port.lost}, timeout=STEADY_S)
             steady = not port.lost.done()
@@ -361,33 +350,49 @@ class _UdpIn(_UdpOut):
 # --- openers ------------------------------------------------------------------------------------------
 
 
+async def _at_first(link: Link, opened: Callable[[tuple[str, int]], Awaitable[_Port]]) -> _Port:
+    """The port at the first of the host's addresses where one can be opened."""
+    *others, last = await link.addresses()
+    for address in others:
+        with contextlib.suppress(OSError):
+            return await opened((address, link.spec.number))
+    return await opened((last, link.spec.number))
+
+
 async def _open_udpout(link: Link) -> _Port:
-    address = (link.spec.target, link.spec.number)
     loop = asyncio.get_running_loop()
-    _, port = await loop.create_datagram_endpoint(lambda: _UdpOut(link), remote_addr=address)
-    return port
+
+    async def opened(address: tuple[str, int]) -> _Port:
+        return (await loop.create_datagram_endpoint(lambda: _UdpOut(link), remote_addr=address))[1]
+
+    return await _at_first(link, opened)
 
 
 async def _open_udpin(link: Link) -> _Port:
-    address = (link.spec.target, link.spec.number)
     loop = asyncio.get_running_loop()
-    _, port = await loop.create_datagram_endpoint(lambda: _UdpIn(link), local_addr=address)
-    return port
+
+    async def opened(address: tuple[str, int]) -> _Port:
+        return (await loop.create_datagram_endpoint(lambda: _UdpIn(link), local_addr=address))[1]
+
+    return await _at_first(link, opened)
 
 
 async def _open_tcp(link: Link) -> _Port:
     loop = asyncio.get_running_loop()
-    transport, port = await loop.create_connection(lambda: _Stream(link), link.spec.target, link.spec.number)
-    _bound_waiting(transport)
-    return port
+
+    async def opened(address: tuple[str, int]) -> _Port:
+        transport, port = await loop.create_connection(lambda: _Stream(link), *address)
+        _bound_waiting(transport)
+        return port
+
+    return await _at_first(link, opened)
 
 
 async def _open_tcpin(link: Link) -> _Port:
+    addresses = await link.addresses()
     port = _TcpIn(link)
     loop = asyncio.get_running_loop()
-    port.server = await loop.create_server(
-        lambda: _Accepted(port), link.spec.target, link.spec.number, backlog=1
-    )
+    port.server = await loop.create_server(lambda: _Accepted(port), addresses, link.spec.number, backlog=1)
     return port
 
 

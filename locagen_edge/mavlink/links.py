@@ -52,6 +52,11 @@ class Links:
         return sum(link.dropped for link in self.links)
 
     @property
+    def flooded_bytes(self) -> int:
+        """What came in beyond all measure and was not read, over all links."""
+        return sum(link.flooded_bytes for link in self.links)
+
+    @property
     def refused(self) -> int:
         return sum(link.refused for link in self.links)
 

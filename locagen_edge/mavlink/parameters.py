@@ -235,6 +235,9 @@ def kept(settings: Settings) -> tuple[Settings, list[str], list[str]]:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return settings, [], []
+    except PermissionError:
+        lost = "what was set over MAVLink does not hold here"
+        return settings, [], [f"{path}: may not be read, {lost}: as root, or the user locagen-edge"]
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         why = getattr(error, "strerror", None) or "cannot be understood; delete it"
         return settings, [], [f"{path}: {why}"]

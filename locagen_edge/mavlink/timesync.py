@@ -77,11 +77,6 @@ class SyncedClock(BootClock):
         self._offset_ns = round(statistics.median(offset for _, offset in shortest))
 
     @property
-    def round_trip_s(self) -> float | None:
-        """The shortest round trip of late; None: no answer has come."""
-        return min(trip for trip, _ in self._answers) * 1e-9 if self._answers else None
-
-    @property
     def synced(self) -> bool:
         """Whether answers decide, not arrivals."""
         if self._offset_ns is None:

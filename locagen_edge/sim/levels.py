@@ -27,8 +27,3 @@ def band_power(signal: Array, rate_hz: float) -> float:
 def from_db(level_db: float) -> float:
     """Power ratio of a level in dB."""
     return float(10.0 ** (level_db / 10.0))
-
-
-def to_db(power: float) -> float:
-    """Level in dB of a power ratio above zero."""
-    return float(10.0 * np.log10(power))

@@ -77,10 +77,12 @@ class Detector:
         """The background's power with this frame in it."""
         if self._smooth is None:
             self._smooth = level
-        self._smooth += (level - self._smooth) * (1.0 - math.exp(-elapsed_s / SMOOTH_S))
+        old = math.exp(-elapsed_s / SMOOTH_S)
+        # a mean and not a step towards the level, which rounds to nothing at all after a far louder frame
+        self._smooth = old * self._smooth + (1.0 - old) * level
         self._piece_s += elapsed_s
         if not self._minima or self._piece_s > self._settings.background_s / PIECES:
             self._minima.append(self._smooth)
             self._piece_s = 0.0
         self._minima[-1] = min(self._minima[-1], self._smooth)
-        return BIAS * min(self._minima)
+        return max(BIAS * min(self._minima), SILENCE)

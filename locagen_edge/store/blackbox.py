@@ -12,7 +12,8 @@ of small computers jump when they first learn the time, this one does not):
   `snippet` (a name in the folder `calls`, or null);
 - `sighting`: a look that went into a position (`sightings.py`), which `locagen-edge fuse` reads;
 - `fault`: `event` begin or end, `text`;
-- `link`, `source`, `losses`: a state of the daemon that has changed;
+- `link`, `source`, `losses`, `listening` (`on`: as commanded), `parameters` (by name, those that differ from
+  the settings file): a state of the daemon that has changed;
 - `lost`: `records` that could not be written.
 
 Written in a thread of its own behind a bounded queue. A disk that is full or read-only is told once and tried
@@ -82,6 +83,8 @@ class _Heard:
     estimate: Estimate
     utc_ns: int
     """of the frame's first sample"""
+    settings: Settings
+    """it was heard with"""
 
 
 @dataclass
@@ -106,6 +109,7 @@ class BlackBox:
         )
         self._snippets = Snippets(directory / CALLS, settings) if log_settings.snippets else None
         self._directory = directory
+        self._settings = settings
         # numbers of callers begin anew with each start, and another start is another observer
         self._observer = f"{settings.position.vehicle or socket.gethostname()} {_iso(time.time_ns())[:19]}Z"
         self._states: dict[str, Any] = {}
@@ -133,7 +137,11 @@ class BlackBox:
     def hear(self, frame: Frame, estimate: Estimate) -> None:
         """What the pipeline made of a frame."""
         utc_ns = time.time_ns() - time.monotonic_ns() + frame.t_ns
-        self._worker.put(_Heard(frame, estimate, utc_ns))
+        self._worker.put(_Heard(frame, estimate, utc_ns, self._settings))
+
+    def apply(self, settings: Settings) -> None:
+        """What the pipeline hears with from here on. Bounds stay those of the beginning."""
+        self._settings = settings
 
     def watch(self, **states: dict[str, Any]) -> None:
         """The daemon's states by name: a change makes a record of this type."""
@@ -197,6 +205,7 @@ class BlackBox:
     def _record_sound(self, heard: _Heard, *, begins: bool) -> None:
         if self._snippets is None:
             return
+        self._snippets.apply(heard.settings)
         try:
             utc = datetime.fromtimestamp(heard.utc_ns * 1e-9, UTC)
             name = self._snippets.hear(heard.frame, utc, begins=begins, calling=bool(self._calls))

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from locagen_edge.errors import StorageError
 from locagen_edge.jsonl import Record, encode, read
 from locagen_edge.store.folder import groups, make_room, size_of, sync
 
@@ -98,8 +99,14 @@ class Journal:
 
 
 def records(directory: Path) -> Iterator[Record]:
-    """All whole records of a log, oldest first, also while it is being written. Raises `OSError`."""
-    for paths in groups(directory, FILES).values():
+    """All whole records of a log, oldest first, also while it is being written.
+
+    Raises `OSError`, and `StorageError` for a folder without a log.
+    """
+    parts = groups(directory, FILES)
+    if not parts:
+        raise StorageError(f"{directory}: there is no log (log-*.jsonl) in this folder")
+    for paths in parts.values():
         try:
             yield from read(paths[0])
         except FileNotFoundError:  # given up for a new one meanwhile

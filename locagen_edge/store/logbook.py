@@ -8,8 +8,9 @@ from datetime import UTC, datetime
 
 from locagen_edge.jsonl import Record
 
+OF_ALL = {"type", "utc", "t_ns"}
 OF_A_FRAME = {"bearing", "sighting"}
-HEADER = f"{'utc':23}  {'type':8}  what"
+HEADER = f"{'utc':23}  {'type':10}  what"
 
 
 def row(record: Record) -> str:
@@ -18,9 +19,9 @@ def row(record: Record) -> str:
     try:
         text = IN_WORDS[kind](record)
     except (KeyError, TypeError, ValueError, AttributeError):
-        text = json.dumps({k: v for k, v in record.items() if k not in ("type", "utc", "t_ns")})
+        text = json.dumps({k: v for k, v in record.items() if k not in OF_ALL})
     utc = str(record.get("utc", "")).removesuffix("+00:00").replace("T", " ")
-    return f"{utc:23}  {kind:8}  {text}".replace("\n", " ")
+    return f"{utc:23}  {kind:10}  {text}".replace("\n", " ")
 
 
 def chosen(records: Iterable[Record], kinds: set[str], since: datetime | None) -> Iterator[Record]:
@@ -79,6 +80,10 @@ def _call(r: Record) -> str:
     return f"{r['call']} ends after {seconds:.1f} s, best {_direction(r['best'])}{where}{snippet}"
 
 
+def _values(r: Record) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in r.items() if name not in OF_ALL)
+
+
 def _start(r: Record) -> str:
     audio, bearing = r["settings"]["audio"], r["settings"]["bearing"]
     return f"locagen-edge {r['version']}: {audio['source']} source, {bearing['estimator']} estimator"
@@ -93,6 +98,8 @@ IN_WORDS: dict[str, Callable[[Record], str]] = {
     "fault": lambda r: f"{'! ' if r['event'] == 'begin' else 'cleared: '}{r['text']}",
     "link": lambda r: "up" if r["up"] else f"down: {r['error'] or 'nobody heard yet'}",
     "source": lambda r: f"no sound: {r['fault']}" if r["fault"] else "sound",
-    "losses": lambda r: ", ".join(f"{v} {k}" for k, v in r.items() if k not in ("type", "utc", "t_ns")),
+    "losses": lambda r: ", ".join(f"{v} {k}" for k, v in r.items() if k not in OF_ALL),
+    "listening": lambda r: "listening" if r["on"] else "told to stop listening",
+    "parameters": lambda r: _values(r) or "as in the settings file",
     "lost": lambda r: f"{r['records']} records could not be written",
 }

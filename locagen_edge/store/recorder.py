@@ -20,6 +20,9 @@ from locagen_edge.store.part import Block, Bound, Part, Session, recover
 from locagen_edge.store.worker import Worker
 from locagen_edge.types import F64, Array
 
+Sound = tuple[Block, Settings]
+"""with the settings it came under"""
+
 MB = 1_000_000
 WAITING_S = 10.0
 """sound that may wait for the disk"""
@@ -58,6 +61,7 @@ class Recorder:
         self._failure = ""
         self._directory = directory
         self._settings = settings
+        self._of_part = settings
         self._bounds = settings.record
         prepare(directory)
         recover(directory)
@@ -80,7 +84,7 @@ class Recorder:
             raise StorageError(f"{directory}: {error.strerror}") from error
         if self._failure:
             raise StorageError(self._failure)
-        self._worker: Worker[Block | bytes] = Worker(
+        self._worker: Worker[Sound | bytes] = Worker(
             "recorder", WAITING_S, self._write, self._sync_if_due, self._end,
             turn_s=settings.record.sync_s / 4, size=_seconds,
         )  # fmt: skip
@@ -89,7 +93,7 @@ class Recorder:
 
     def block(self, rows: Array, rate_hz: float, origin_ns: int) -> None:
         """Takes rows (n, channels), int16 or float32."""
-        if self._worker.put(Block(rows, rate_hz, origin_ns, self._gap)):
+        if self._worker.put((Block(rows, rate_hz, origin_ns, self._gap), self._settings)):
             self._gap = None
         else:
             self.gap(1)
@@ -98,6 +102,14 @@ class Recorder:
         self._gap = overruns + (self._gap or 0)
 
     # --- from anywhere
+
+    def apply(self, settings: Settings) -> None:
+        """Settings that hold from here on: they begin a part, so that those beside a part hold for all of it.
+
+        The sound comes a frame or two before what is made of it. Bounds stay those of the beginning.
+        """
+        if settings != self._settings:
+            self._settings = settings
 
     @property
     def failure(self) -> str:
@@ -133,7 +145,7 @@ class Recorder:
 
     # --- in the writing thread
 
-    def _write(self, item: Block | bytes) -> None:
+    def _write(self, item: Sound | bytes) -> None:
         if self._failure:
             return
         try:
@@ -141,17 +153,19 @@ class Recorder:
                 if self._part is not None and self._room_for(self._part, len(item)):
                     self._part.line(item)
             else:
-                self._write_block(item)
+                self._write_block(*item)
         except OSError as error:
             self._fail(f"{self._directory}: {error.strerror}: the recording ends here")
 
-    def _write_block(self, block: Block) -> None:
-        if self._part is not None and not self._part.takes(block, self._bounds.part_s):
+    def _write_block(self, block: Block, settings: Settings) -> None:
+        part, same = self._part, settings is self._of_part
+        if part is not None and not (same and part.takes(block, self._bounds.part_s)):
             self._finish()
         if self._part is None:
             self._bound.count()
             part_bytes = round(self._bounds.part_mb * MB)
-            self._part = Part(self._directory, self._session, block, part_bytes, self._settings)
+            self._part = Part(self._directory, self._session, block, part_bytes, settings)
+            self._of_part = settings
         if self._room_for(self._part, block.size):
             self._part.write(block)
             self._count(block)
@@ -218,5 +232,5 @@ class Recorder:
                 recover(self._directory)
 
 
-def _seconds(item: Block | bytes) -> float:
-    return 0.0 if isinstance(item, bytes) else len(item.rows) / item.rate_hz
+def _seconds(item: Sound | bytes) -> float:
+    return 0.0 if isinstance(item, bytes) else len(item[0].rows) / item[0].rate_hz

@@ -2,6 +2,8 @@
 
 They hold the microphones at the processing rate, in the channels that `audio.channel_map` chooses them from,
 as FLAC once they are whole: `replay` reads them with the settings beside them. Time is that of the frames.
+
+Frames come with the channels' delays and gains taken out: the settings beside say that there are none left.
 """
 
 from __future__ import annotations
@@ -45,6 +47,10 @@ class Snippets:
         self._origin_ns = 0  # time of the first row since the beginning or the last gap
         self._called_ns = 0  # when something was last calling
         self._synced_s = 0.0
+
+    def apply(self, settings: Settings) -> None:
+        """What stands beside a snippet that begins from here on. Bounds stay those of the beginning."""
+        self._settings = settings
 
     def hear(self, frame: Frame, utc: datetime, *, begins: bool, calling: bool) -> str:
         """Takes every frame, in order. Name of the snippet that it went into; empty: none.
@@ -102,7 +108,9 @@ class Snippets:
         self._bound.count()
         session = Session.begin(self._directory, utc)
         self._written_s = 0.0
-        self._part = Part(self._directory, session, block, PART_BYTES, self._settings)
+        array = replace(self._settings.array, delays_s=(), gains_db=())
+        settings = replace(self._settings, array=array)
+        self._part = Part(self._directory, session, block, PART_BYTES, settings)
         for number, held in enumerate(self._held):
             self._write(self._part, held, first=number == 0)
 

@@ -33,7 +33,10 @@ SUITE = "bookworm"
 OTHERS = ("dev", "proc", "run", "sys", "tmp", "var/log", "var/cache", "var/lib/dpkg", "var/lib/apt")
 """what changes with every package: lists, logs, caches"""
 AZIMUTH_DEG = 40.0
-AS_SERVICE = "setpriv --reuid=locagen-edge --regid=locagen-edge --init-groups env HOME=/var/lib/locagen-edge"
+AS_SERVICE = (
+    "setpriv --reuid=locagen-edge --regid=locagen-edge --init-groups "
+    "env HOME=/var/lib/locagen-edge STATE_DIRECTORY=/var/lib/locagen-edge"
+)
 
 
 class Failed(Exception):
@@ -51,8 +54,8 @@ class Clean:
         done = subprocess.run(
             ["unshare", "--mount", "--pid", "--ipc", "--uts", "--fork", "--kill-child", "sh", "-c",
              f"mount -t proc proc {self.folder}/proc && exec chroot {self.folder} sh -c \"$0\"", command],
-            env={"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "DEBIAN_FRONTEND": "noninteractive",
-                 "LC_ALL": "C.UTF-8"},
+            env={"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root",
+                 "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C.UTF-8"},
             stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=600,
         )  # fmt: skip
         if done.returncode not in ok:
@@ -115,13 +118,18 @@ def check_all(clean: Clean, package: Path) -> None:
         clean.run(f"apt-get satisfy -y -q --no-install-recommends '{needs}'")
         return needs
 
+    try_it = ""
+
     def install() -> str:
+        nonlocal try_it
         told = clean.run(f"apt-get install -y -q --no-install-recommends /tmp/{name}")
         if "enable --now locagen-edge" not in told:
             raise Failed("does not say what to do next")
         links = [str(p) for p in (clean.folder / "etc/systemd").rglob("locagen-edge.service")]
         if links:
             raise Failed(f"enabled by itself: {links}")
+        # what stands between "try it with" and "then:"; sudo is not there, and not needed by root
+        try_it = told.partition("try it with\n")[2].partition("then:")[0].replace("sudo ", "")
         return "not enabled, and says what to do next; " + clean.run("locagen-edge --version").strip()
 
     def user() -> str:
@@ -131,7 +139,10 @@ def check_all(clean: Clean, package: Path) -> None:
         return told
 
     def checks() -> str:
-        told = clean.run(f"{AS_SERVICE} locagen-edge check --seconds 1")
+        """By the very lines that the installation has printed."""
+        if f"{AS_SERVICE} locagen-edge check" not in " ".join(try_it.replace("\\", "").split()):
+            raise Failed(f"says to try it with {try_it!r}")
+        told = clean.run(try_it)
         return told.strip().splitlines()[-1]
 
     def bearings() -> str:

@@ -122,13 +122,14 @@ def test_a_broadcast_is_answered_only_where_a_message_is_asked_for_that_we_have(
     assert [m.get_type() for m in got] == ["COMMAND_ACK", "AUTOPILOT_VERSION"]
 
 
-def test_sent_again_it_is_acknowledged_again_and_done_once() -> None:
+@pytest.mark.parametrize("unused", [0.0, math.nan])
+def test_sent_again_it_is_acknowledged_again_and_done_once(unused: float) -> None:
     moving, done = hands()
     component = Component(MavlinkSettings(), hands=moving)
     for k in range(3):
-        assert results(ask(component, command(FORGET), now_s=0.5 * k)) == [ACCEPTED]
+        assert results(ask(component, command(FORGET, *[unused] * 4), now_s=0.5 * k)) == [ACCEPTED]
     assert done == ["forget"]
-    assert results(ask(component, command(FORGET), now_s=1.1 + RESEND_S)) == [ACCEPTED]
+    assert results(ask(component, command(FORGET, *[unused] * 4), now_s=1.1 + RESEND_S)) == [ACCEPTED]
     assert done == ["forget", "forget"]
 
 

@@ -28,6 +28,7 @@ from test_twins import TAKEN, Other
 from locagen_edge.daemon import Daemon
 from locagen_edge.mavlink import dialect
 from locagen_edge.mavlink.framer import Framer
+from locagen_edge.mavlink.link import BURST
 from locagen_edge.settings import Settings, from_table
 from locagen_edge.store.journal import records
 from locagen_edge.types import Frame
@@ -98,8 +99,10 @@ def test_a_link_that_is_cut_in_mid_message_again_and_again(tmp_path: Path) -> No
                 server.received.clear()
                 await until(lambda: names(server.received)["HEARTBEAT"])
                 assert names(server.received)["LOCAGEN_BEARING"] or visit == 0
+                framer = daemon.component.received[0]
+                before = framer.frames
                 server.writers[0].write(HEARTBEAT + HEARTBEAT[:HALF])
-                await until(lambda: daemon.links.links[0].received_bytes >= len(HEARTBEAT) + HALF)
+                await until(lambda: framer.frames > before and framer.waiting == HALF)  # noqa: B023
                 await server.close()
                 await until(lambda: not daemon.links.up)
             await server.open()
@@ -193,13 +196,35 @@ def test_a_flood_of_2000_messages_a_second(tmp_path: Path) -> None:
                     await asyncio.sleep(0.01)
                 assert daemon.counters.estimates > before + 10, "it heard on meanwhile"
                 assert daemon.component.received[0].frames > 1000
-                assert daemon.component.changes.held_back > 50
+                held_back = daemon.component.changes.held_back
+                assert held_back > 50
+                assert f"{held_back} commands or parameters held back" in daemon._in_words()
+                assert "of a flood not read" not in daemon._in_words()
                 read(peer)
                 peer.sendto(packed(common.MAVLink_ping_message(7, 99, 0, 0), 255, 190), ours)
                 got = bytearray()
                 await until(lambda: got.extend(read(peer)) or names(got)["PING"])
 
     asyncio.run(test())
+
+
+def test_what_is_not_read_of_a_flood_is_told(tmp_path: Path) -> None:
+    """In the status line and in the log."""
+
+    def logged() -> list[Any]:
+        return [r for r in records(tmp_path / "log") if r["type"] == "losses" and r["flooded_bytes"]]
+
+    async def test() -> None:
+        with closing(udp()) as peer:
+            async with flying(f"udpout:127.0.0.1:{peer.getsockname()[1]}", tmp_path) as daemon:
+                (link,) = daemon.links.links
+                link.take(bytes(BURST))  # nothing but noise
+                link.take(bytes(50_000))
+                assert "50000 bytes of a flood not read" in daemon._in_words()
+                await until(logged)
+
+    asyncio.run(test())
+    assert (logged()[0]["flooded_bytes"], logged()[0]["held_back"]) == (50_000, 0)
 
 
 def test_the_wall_clock_that_steps(tmp_path: Path) -> None:

@@ -144,8 +144,7 @@ def test_udpout_sends_there_and_hears_the_answer() -> None:
                 assert data == FRAME
                 peer.sendto(b"answer", address)
                 await until(lambda: received == b"answer")
-                assert (link.sent, link.sent_bytes, link.received_bytes) == (1, len(FRAME), 6)
-                assert (link.dropped, link.refused, link.reopened) == (0, 0, 0)
+                assert (link.dropped, link.refused) == (0, 0)
 
     run(test)
 
@@ -155,6 +154,7 @@ def test_udpout_with_nobody_there_yet_goes_on_in_silence(caplog: pytest.LogCaptu
         port = free_port(socket.SOCK_DGRAM)
         async with running(f"udpout:127.0.0.1:{port}") as (link, _):
             await until(lambda: link.up)
+            opened = link._port
             for _ in range(50):
                 assert link.send(FRAME)
                 await asyncio.sleep(0)
@@ -166,7 +166,7 @@ def test_udpout_with_nobody_there_yet_goes_on_in_silence(caplog: pytest.LogCaptu
                 link.send(FRAME)  # may still fetch the refusal of the one before
                 link.send(FRAME)
                 assert await datagram(late) == FRAME
-            assert link.reopened == 0
+            assert link._port is opened
 
     caplog.set_level(logging.INFO)
     run(test)
@@ -202,7 +202,8 @@ def test_udpout_is_reopened_when_its_socket_fails() -> None:
                 port.error_received(OSError(101, "network is unreachable"))
                 assert not link.up
                 await until(lambda: link.up)
-                assert (link.reopened, link.last_error) == (1, "Network is unreachable")
+                assert link._port is not port
+                assert link.last_error == "Network is unreachable"
                 link.send(FRAME)
                 assert await datagram(peer) == FRAME
 
@@ -226,7 +227,7 @@ def test_udpin_sends_to_those_it_heard_from() -> None:
                 assert await datagram(one) == await datagram(two) == FRAME
                 with pytest.raises(BlockingIOError):
                     scan.recv(2000)
-            assert (link.sent, link.dropped) == (1, 1)
+            assert link.dropped == 1
 
     run(test)
 
@@ -308,10 +309,10 @@ def test_tcp_comes_back_when_the_other_end_does(
             await until(lambda: link.last_error)
             await asyncio.sleep(0.2)
             assert link.last_error == "Connection refused"
-            for visit in range(3):
+            for _ in range(3):
                 await server.open()
                 await until(lambda: link.up and server.writers)
-                assert link.reopened == visit
+                assert len(server.writers) == 1
                 assert link.send(FRAME)
                 await until(lambda: bytes(server.received).endswith(FRAME))
                 server.received.clear()
@@ -344,11 +345,11 @@ def test_a_refused_port_is_one_line_however_often_it_is_tried(caplog: pytest.Log
 def test_a_name_that_is_none_is_one_line(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def no_such_name(*_: Any, **__: Any) -> Any:
+    def no_such_name(*_: Any, **__: Any) -> Any:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
     async def test() -> None:
-        monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", no_such_name)
+        monkeypatch.setattr(socket, "getaddrinfo", no_such_name)
         async with running("tcp:no-such-host.invalid:5760") as (link, _):
             await until(lambda: link.last_error)
             assert link.last_error == "Name or service not known"
@@ -413,17 +414,17 @@ def test_a_peer_that_does_not_read_costs_frames_and_no_time() -> None:
         async with running(f"tcp:127.0.0.1:{server.port}") as (link, _):
             await until(lambda: link.up and server.writers)
             server.writers[0].transport.pause_reading()
-            longest_s = 0.0
+            sent, longest_s = 0, 0.0
             for k in range(60_000):
                 began = time.perf_counter()
-                link.send(bytes(280))
+                sent += link.send(bytes(280))
                 longest_s = max(longest_s, time.perf_counter() - began)
                 if k % 100 == 0:
                     await asyncio.sleep(0)
                 if link.dropped > 1000:
                     break
             assert link.dropped > 1000
-            assert link.sent + link.dropped == k + 1
+            assert sent + link.dropped == k + 1
             assert longest_s < 0.25  # microseconds; the rest is for a busy computer
             assert link._port.transport.get_write_buffer_size() <= road.BUFFERED  # type: ignore[union-attr]
             assert link.up
@@ -437,6 +438,7 @@ def test_tcpin_lets_one_connect_and_the_latest_wins() -> None:
         port = free_port(socket.SOCK_STREAM)
         async with running(f"tcpin:127.0.0.1:{port}") as (link, received):
             await until(lambda: link._port)
+            listener = link._port
             assert not link.up, "nobody to send to"
             assert not link.send(FRAME)
             for visit in range(3):
@@ -459,7 +461,7 @@ def test_tcpin_lets_one_connect_and_the_latest_wins() -> None:
                         later.close()
                 writer.close()
                 await until(lambda: not link.up)
-            assert link.reopened == 0
+            assert link._port is listener
 
     run(test)
 
@@ -496,7 +498,7 @@ def test_of_a_flood_only_so_much_is_read(arrivals: list[tuple[float, int]]) -> N
             now_s += pause_s
             link.take(bytes(size))
             taken += size
-    assert sum(size for _, size in read) + link.flooded_bytes == link.received_bytes == taken
+    assert sum(size for _, size in read) + link.flooded_bytes == taken
     for first, (begin_s, _) in enumerate(read):
         total = 0
         for t_s, size in read[first:]:
@@ -539,9 +541,8 @@ def test_serial_is_reopened_when_it_was_unplugged(tmp_path: Path, caplog: pytest
     async def test() -> None:
         uart = Uart(tmp_path / "uart")
         async with running(f"serial:{uart.path}:57600") as (link, received):
-            for visit in range(3):
+            for _ in range(3):
                 await until(lambda: link.up)
-                assert link.reopened == visit
                 assert link.send(FRAME)
                 got = bytearray()
                 await until(lambda: got.extend(uart.read()) or got == FRAME)  # noqa: B023

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -243,6 +244,19 @@ def test_a_damaged_file_is_told_and_changes_nothing(tmp_path, content: bytes, fa
     assert len(faults) == 1
     assert fault in faults[0]
     assert "delete" in faults[0]
+
+
+def test_what_may_not_be_read_is_told_with_what_to_do(tmp_path, monkeypatch) -> None:
+    """The service's file, by hand as another user."""
+    base = from_table({"mavlink": {"state_directory": str(tmp_path)}})
+
+    def refused(self: Path, encoding: str) -> str:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "read_text", refused)
+    settings, told, (fault,) = kept(base)
+    assert (settings, told) == (base, [])
+    assert "what was set over MAVLink does not hold here: as root, or the user locagen-edge" in fault
 
 
 def test_a_good_line_counts_beside_a_bad_one(tmp_path) -> None:

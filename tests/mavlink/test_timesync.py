@@ -60,7 +60,6 @@ def test_on_an_even_way_it_is_exact() -> None:
     autopilot, clock = Autopilot(1, 10**12, jitter_ns=0.0), SyncedClock()
     now_ns = synced(autopilot, clock, 5)
     assert clock.time_us(now_ns) == (autopilot.clock(now_ns) // 1000, True)
-    assert clock.round_trip_s == pytest.approx(4e-3)
 
 
 def test_answers_that_nobody_asked_for_count_nothing() -> None:
