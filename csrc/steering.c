@@ -938,19 +938,19 @@ static double contrast(const steer *s, const locagen_spread *spread, int n, int 
 
 /* By how much the noise turns a direction of the grid more than theory knows, as variance: where q strayed wild
  * times as far as it should have, noise beside noise, of 1 in q, pulls wild times as hard; source beside noise,
- * q - 1, as ever. Each part of the band counts by its share of the information, f^2 (q - 1)^2 / q. */
-static double unrest(const steer *s, const locagen_spread *spread, int n)
+ * q - 1, as ever. Each part of the band counts by its share of the information, f^2 (q - 1)^2 / q. What counts by
+ * a weight w pulls w times as hard and is known w times as well: its variance is w^2 where the score says w. */
+static double unrest(const steer *s, const locagen_spread *spread, double t, int n)
 {
     const locagen_response *r = &s->coarse;
     double known = 0, pulled = 0;
-    if (spread->calm == NULL)
-        return 1;
     for (int k = 0; k < r->bins; k++) {
         double over = (double)spread->seen[place_in_spread(s, n) + (long)k * s->paths->width];
         double f = s->spectrum.first_bin + (k + 0.5) * r->thinning, wild = 1 / (double)calmness(s, spread, n, k);
+        double weight = (double)r->looks[k] / (t * r->thinning);
         double information = (double)(r->looks[k] * trust(s, spread, n, k)) * f * f * over * over / (1 + over);
         known += information;
-        pulled += information * (over + wild) / (over + 1);
+        pulled += information * weight * (over + wild) / (over + 1);
     }
     return known > 0 ? pulled / known : 1;
 }
@@ -1067,7 +1067,7 @@ int locagen_steer_search(locagen_steer *memory, int32_t span, int32_t most, floa
         relax(s, how, &spread, t, sure, aims);
     for (int n = 0; n < found; n++) {
         aims[n].score = score[n], aims[n].mean_q = mean_q[n];
-        out[n] = told(&aims[n], how.mics, unrest(s, &spread, aims[n].at));
+        out[n] = told(&aims[n], how.mics, unrest(s, &spread, t, aims[n].at));
         out[n].contrast = (float)first;
         out[n].rival = n == 0 ? (float)aims[0].rival : 0.0f;
     }

@@ -812,6 +812,22 @@ def test_weights_choose_the_bins_that_count() -> None:
         whole.weigh(np.ones(3, np.float32))
 
 
+@pytest.mark.parametrize("weight", [0.25, 0.7])
+def test_a_weight_that_is_the_same_everywhere_makes_no_sigma_wider(weight: float) -> None:
+    """Which direction and how well it is known follow from weights against each other."""
+    rng = np.random.default_rng(6)
+    found = steered()
+    for _ in range(60):
+        listen(found, hiss(rng))
+        found.learn(0.05)
+    call = hiss(rng) + wave(rng, 1.0, -0.4, level=0.02)
+    (plain,) = heard(found, call)
+    found.weigh(np.full(len(found.frequency_hz), weight, np.float32))
+    (weighed,) = heard(found, call)
+    assert weighed.azimuth_rad == pytest.approx(plain.azimuth_rad, abs=1e-4)
+    assert weighed.sigma_rad() == pytest.approx(plain.sigma_rad(), rel=0.01)
+
+
 def test_the_gain_is_what_the_call_has_of_each_bin() -> None:
     """1 - noise / power: of hiss that has become louder, and of a call in half of the band."""
     rng = np.random.default_rng(7)
